@@ -1,0 +1,58 @@
+"""What every test shares: the board's search path under CPython, a fresh simulated machine, and the runtimes."""
+
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+for folder in ("boards/sim", "firmware", "lib", "host_tests", "host_tests/sim", "host_tests/shim"):
+    sys.path.insert(0, str(ROOT / folder))
+
+import micropython  # noqa: E402, F401  (the shim: it prepares `time` before anything of lib/ is imported)
+import pytest  # noqa: E402
+
+from upright import runtimes  # noqa: E402
+
+PORTABLE = Path(__file__).parent / "portable"
+
+
+@pytest.fixture(autouse=True)
+def fresh_machine():
+    """Every test starts with a board that has just been powered, and nothing wired to it."""
+    import machine
+
+    machine.power_on()
+    yield
+    machine.power_on()
+
+
+def require(name: str) -> str:
+    """Skip, in one clear line, where a runtime cannot be had on this machine."""
+    try:
+        runtimes.interpreter(name)
+    except runtimes.Unavailable as why:
+        pytest.skip(f"runtime {name}: {why}")
+    return name
+
+
+@pytest.fixture(params=runtimes.NAMES)
+def runtime(request):
+    """Each runtime in turn."""
+    return require(request.param)
+
+
+@pytest.fixture(params=[name for name in runtimes.NAMES if name != "cpython"])
+def micropython_runtime(request):
+    """Each MicroPython in turn: those that can refuse to allocate."""
+    return require(request.param)
+
+
+@pytest.fixture
+def portable():
+    """run(runtime, script, *args) -> what a script of host_tests/portable printed; its failure fails the test."""
+
+    def run(name, script, *args, timeout=300):
+        done = runtimes.run(name, PORTABLE / script, args, timeout=timeout)
+        assert done.returncode == 0, f"{script} on {name}:\n{done.stdout}\n{done.stderr}"
+        return done.stdout
+
+    return run
