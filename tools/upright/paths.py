@@ -26,4 +26,4 @@ def cache() -> Path:
 def board_path(board: str = "sim", simulated: bool = True) -> list[Path]:
     """The folders that together hold what a board's root and lib folders would."""
     folders = [SIM] if simulated else []
-    return folders + [LIB, FIRMWARE, BOARDS / board]
+    return [*folders, LIB, FIRMWARE, BOARDS / board]

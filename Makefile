@@ -1,0 +1,26 @@
+# Everything from a clone: `make demo` and `make test`. What is fetched goes into .venv and a cache (~/.cache/upright).
+PYTHON ?= python3
+VENV = .venv/bin
+PARALLEL ?= auto
+
+.PHONY: setup demo test lint bench clean
+
+setup:  ## .venv with .venv/bin/upright
+	@$(PYTHON) tools/bootstrap.py
+
+demo: setup  ## the firmware on the simulated board
+	@$(VENV)/upright demo
+
+test: setup lint  ## everything, on every runtime that this machine can have
+	@$(VENV)/upright runtimes
+	@$(VENV)/python -m pytest -n $(PARALLEL) $(PYTEST_ARGS)
+
+lint: setup
+	@$(VENV)/ruff check .
+	@$(VENV)/ruff format --check .
+
+bench: setup  ## instructions and memory, as ratios measured in one run
+	@$(VENV)/upright bench
+
+clean:
+	rm -rf .venv tools/*.egg-info .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,280 @@
+# The application: finds the sensor, measures its bias, starts the tick, and shows what comes out.
+# Needs a board (a module as boards/<name>/board.py). Every port.
+
+import time
+from array import array
+
+import config
+import filters
+import fixmath
+import machine
+import pages
+import tick as ticks
+from micropython import const
+
+_FRAME_MS = const(100)
+_RATE_MS = const(1000)
+_LOST_MS = const(300)  # without a fresh sample the attitude is only carried on
+_RETRY_MS = const(1000)
+_GUARD_HZ = const(50)
+
+# At rest: what the gyro and accelerometer of an MPU6050 may move in a window, and how far a bias may lie (PS 6.1:
+# zero-rate output +-20 deg/s).
+_REST_GYRO_DPS = const(3)
+_REST_ACCEL_MG = const(120)
+_BIAS_MOST_DPS = const(20)
+_REST_WINDOW_MS = const(1000)
+_REST_TRIES = const(4)
+
+
+class App:
+    """One board's application: run() never returns.
+
+    tick, filter, imu, display, ticker are there once start() is through; bias_known says whether the gyro's bias
+    was measured.
+    """
+
+    def __init__(self, board):
+        self.board = board
+        self.config = config.Config(board)
+        self.imu = None
+        self.filter = None
+        self.tick = None
+        self.ticker = None
+        self.guard = None
+        self.display = None
+        self.bias_known = False
+        self.angles = array("i", [0] * 3)  # roll, pitch, yaw in millidegrees
+        self.rate_hz = 0
+        self._snapshot = array("i", [0] * 6)
+        self._page = 0
+        self._pages = None
+        self._frame_at = self._rate_at = self._page_at = self._fresh_at = time.ticks_ms()
+        self._rate_steps = 0
+        self._last_fresh = 0
+        self._reported = 0
+
+    # ------------------------------------------------------------------------------------ start
+
+    def run(self):
+        self.start()
+        while True:
+            self.poll()
+            machine.idle()
+
+    def start(self):
+        board = self.board
+        print("upright on", board.NAME)
+        self._open_display()
+        self.say("Upright", board.NAME, "looking for", "the sensor")
+        while not self._open_sensor():
+            self._wait(_RETRY_MS)
+        imu = self.imu
+        rate = self.config.RATE
+        if self.config.DRIVE != "timer" and not self.config.EXTERNAL_CLOCK:
+            rate = imu.sample_rate  # every packet or data-ready edge is one step, so the chip's rate is the rate
+        self.filter = filters.make(self.config.FILTER, rate, imu, self.config.GAINS)
+        if self.config.MEASURE_BIAS:
+            self.say("Keep still", "measuring the", "gyro's bias")
+            self.bias_known = self._measure_bias()
+            if not self.bias_known:
+                print("bias: never at rest, going on without (marked B? on the display)")
+        self._seed()
+        self._start_tick(rate)
+        print("tick: %s, every %d us, %s drive" % (self.ticker.what, self._period_us, self.config.DRIVE))
+
+    def _open_display(self):
+        try:
+            self.display = self.board.display(self.config.DISPLAY_CHUNK)
+            if self.display is not None:
+                self._pages = pages.Pages(self.display)
+                self.display.begin()
+        except OSError as why:  # the attitude is worth having without a display; it may still appear
+            print("display:", why)
+
+    def _open_sensor(self):
+        board = self.board
+        try:
+            imu = board.sensor()
+            imu.configure(
+                accel_range_g=self.config.ACCEL_RANGE_G,
+                gyro_range_dps=self.config.GYRO_RANGE_DPS,
+                dlpf=self.config.DLPF,
+                sample_rate_hz=self.config.SENSOR_RATE_HZ or self.config.RATE,
+            )
+        except OSError as why:
+            print("sensor:", why)
+            self.say("No sensor", str(why))
+            return False
+        print(
+            "sensor: %s, %d/%d Hz, +-%d g, +-%d deg/s"
+            % ((imu.chip,) + imu.sample_rate + (imu.accel_range_g, imu.gyro_range_dps))
+        )
+        self.imu = imu
+        return True
+
+    def _measure_bias(self):
+        """Mean of the gyro over a window at rest -> True; False when it never rested."""
+        imu = self.imu
+        num, den = imu.gyro_scale
+        gyro_most = _REST_GYRO_DPS * num // den
+        bias_most = _BIAS_MOST_DPS * num // den
+        accel_most = imu.accel_lsb_per_g * _REST_ACCEL_MG // 1000
+        for _ in range(_REST_TRIES):
+            low = array("h", [32767] * 6)
+            high = array("h", [-32768] * 6)
+            total = [0] * 6
+            n = 0
+            start = time.ticks_ms()
+            while time.ticks_diff(time.ticks_ms(), start) < _REST_WINDOW_MS:
+                if imu.read() & 1:
+                    n += 1
+                    for i in range(6):
+                        c = imu.counts[i]
+                        total[i] += c
+                        low[i] = min(low[i], c)
+                        high[i] = max(high[i], c)
+                time.sleep_ms(2)
+            if n < 50:
+                print("bias: only %d samples in %d ms" % (n, _REST_WINDOW_MS))
+                continue
+            spread = [high[i] - low[i] for i in range(6)]
+            mean = [(2 * 256 * t + n) // (2 * n) for t in total[3:]]  # in 1/256 count
+            if (
+                max(spread[:3]) <= accel_most
+                and max(spread[3:]) <= gyro_most
+                and max(abs(m) for m in mean) <= 256 * bias_most
+            ):
+                self.filter.set_bias(*mean)
+                print("bias: %s mdeg/s" % ([m * 1000 * den // (256 * num) for m in mean],))
+                return True
+            self.say("Keep still", "it moves;", "trying again")
+        return False
+
+    def _seed(self):
+        """The attitude from a first sample; from level when none comes (the tick's feedback does the rest)."""
+        for _ in range(100):
+            if self.imu.read() & 1 and self.filter.seed(self.imu.counts):
+                return
+            time.sleep_ms(2)
+        print("seed: no usable accelerometer sample, starting level")
+
+    def _start_tick(self, rate):
+        board = self.board
+        num, den = rate
+        self._period_us = (2000000 * den + num) // (2 * num)
+        display = self.display if self.config.DISPLAY_SHARES_BUS else None
+        fifo = self.config.DRIVE == "fifo"
+        self.tick = tick = ticks.Tick(
+            self.imu, self.filter, 0 if fifo else self._period_us, display, self.config.DISPLAY_CHUNK
+        )
+        if display is not None:
+            self._flush()  # the bus is the tick's from here on
+        if self.config.DRIVE == "timer":
+            self.ticker = board.make_tick(rate, tick.on_sample)
+        elif fifo:
+            self.imu.fifo_enable()
+            self.ticker = board.make_tick(self.config.FIFO_HZ, tick.on_fifo)
+        elif self.config.DRIVE == "data_ready":
+            self.imu.configure_interrupt()
+            self.ticker = _DataReady(board.data_ready_pin(), tick.on_sample, self._period_us)
+            self.guard = board.make_tick(_GUARD_HZ, tick.on_guard)
+        else:
+            raise ValueError('DRIVE is "timer", "data_ready" or "fifo", not %r' % (self.config.DRIVE,))
+
+    # ------------------------------------------------------------------------------------ main loop
+
+    def poll(self):
+        """One turn of the main loop: never waits."""
+        now = time.ticks_ms()
+        tick = self.tick
+        if self.display is not None and not self.config.DISPLAY_SHARES_BUS and self.display.busy:
+            self.display.flush_step(self.config.DISPLAY_CHUNK)
+        if tick.fresh != self._last_fresh:
+            self._last_fresh = tick.fresh
+            self._fresh_at = now
+        passed = time.ticks_diff(now, self._rate_at)
+        if passed >= _RATE_MS:
+            self._rate_at = now
+            self.rate_hz = ((tick.steps - self._rate_steps) * 1000 + passed // 2) // passed
+            self._rate_steps = tick.steps
+            self._report()
+        if time.ticks_diff(now, self._frame_at) >= _FRAME_MS:
+            self._frame_at = now
+            self.update_angles()
+            self._draw(now)
+
+    def update_angles(self):
+        """The newest attitude into `angles`."""
+        if self.tick.snapshot(self._snapshot):
+            fixmath.euler(self._snapshot, self.angles, self.config.EULER)
+
+    def faults(self):
+        """All that went wrong since the start, and was survived."""
+        imu, tick = self.imu, self.tick
+        n = imu.errors + imu.resets + imu.fifo_overflows + tick.missed + tick.crashes
+        if self.display is not None:
+            n += self.display.errors
+        return n
+
+    def _report(self):
+        tick = self.tick
+        if tick.crashes != self._reported:
+            self._reported = tick.crashes
+            print("tick: %d exceptions, last: %r" % (tick.crashes, tick.error))
+
+    def _draw(self, now):
+        display = self.display
+        if display is None or display.busy:
+            return
+        seconds = self.config.PAGE_SECONDS
+        if seconds and time.ticks_diff(now, self._page_at) >= seconds * 1000:
+            self._page_at = now
+            self._page = (self._page + 1) % pages.COUNT
+        flags = 0 if self.bias_known else pages.BIAS_UNKNOWN
+        if time.ticks_diff(now, self._fresh_at) >= _LOST_MS:
+            flags |= pages.SENSOR_LOST
+        self._pages.draw(
+            self._page,
+            self.angles,
+            self.rate_hz,
+            self.imu.temperature_cdeg(),
+            self.faults(),
+            flags,
+        )
+        display.show()
+
+    # ------------------------------------------------------------------------------------ start-up messages
+
+    def say(self, title, *lines):
+        """A message on the display while the main program owns its bus; the console has its own words."""
+        if self.display is not None:
+            self._pages.message(title, *lines)
+            self.display.show()
+            self._flush()
+
+    def _flush(self):
+        while self.display.busy:
+            self.display.flush_step(self.config.DISPLAY_CHUNK)
+
+    def _wait(self, ms):
+        time.sleep_ms(ms)
+
+
+class _DataReady:
+    """The data-ready line as a tick: hard where the port has hard pin interrupts."""
+
+    def __init__(self, pin, callback, period_us):
+        self.period_us = period_us
+        try:
+            pin.irq(callback, trigger=machine.Pin.IRQ_RISING, hard=True)
+            self.hard = True
+            self.what = "data-ready pin, hard"
+        except (TypeError, ValueError):
+            pin.irq(callback, trigger=machine.Pin.IRQ_RISING)
+            self.hard = False
+            self.what = "data-ready pin, soft: ticks wait for the main program"
+        self._pin = pin
+
+    def stop(self):
+        self._pin.irq(handler=None)

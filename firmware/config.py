@@ -1,0 +1,47 @@
+# The settings of a board and what they are when board.py does not say. Every port.
+
+DEFAULTS = {
+    # Sampling. RATE: steps of the filter in Hz, or (num, den) for num/den Hz.
+    "RATE": 200,
+    # "timer": a timer's tick reads the newest sample; "data_ready": the chip's INT line is the tick;
+    # "fifo": a timer at FIFO_HZ fetches the samples that the chip has queued.
+    "DRIVE": "timer",
+    # Of the chip, Hz; None: as RATE. With the timer drive the chip may sample faster than it is read: a tick then
+    # never comes too early for a fresh sample, and its filter (DLPF) keeps the rest from aliasing.
+    "SENSOR_RATE_HZ": None,
+    "FIFO_HZ": 50,
+    # True where something else clocks the chip's samples (the simulator replaying a trial).
+    "EXTERNAL_CLOCK": False,
+    "ACCEL_RANGE_G": 8,
+    "GYRO_RANGE_DPS": 2000,
+    "DLPF": 2,
+    # The filter by its name in filters.py, and its own arguments.
+    "FILTER": "mahony6",
+    "GAINS": {"kp": 0.5, "ki": 0.0},
+    "EULER": "zyx",
+    # Measure the gyro's bias at the start (the board has to lie still for a second).
+    "MEASURE_BIAS": True,
+    # True: the display is on the sensor's bus, so the tick writes it, DISPLAY_CHUNK bytes at a time.
+    # False: it has a bus of its own and the main program writes it.
+    "DISPLAY_SHARES_BUS": True,
+    "DISPLAY_CHUNK": 32,
+    # Seconds between the display's pages; 0: only the first.
+    "PAGE_SECONDS": 6,
+}
+
+
+class Config:
+    """DEFAULTS, with what the board module says otherwise, as attributes.
+
+    Raises ValueError for a name in capitals that no setting has: a slip of the pen would otherwise go unnoticed.
+    """
+
+    def __init__(self, board):
+        for name in dir(board):
+            setting = name.isupper() and name[0] != "_" and not callable(getattr(board, name))
+            if setting and name != "NAME" and name not in DEFAULTS:
+                raise ValueError("board.py sets %s, which is no setting; see config.py" % name)
+        for name in DEFAULTS:
+            setattr(self, name, getattr(board, name, DEFAULTS[name]))
+        if isinstance(self.RATE, int):
+            self.RATE = (self.RATE, 1)

@@ -1,0 +1,183 @@
+# Boots the firmware (boot.py, main.py) on the simulated board: chips on its buses, a moving world under them.
+# Run by `upright demo` and the tests on every runtime. Arguments: one JSON object, see CONFIG.
+# Lines on standard output that begin with a tab are for the host; the rest is the board's console.
+
+import json
+import sys
+from array import array
+from binascii import hexlify
+
+import kernel
+import machine
+from chips.mpu6050 import MPU6050Chip
+from chips.ssd1306 import SSD1306Chip
+from world import StillWorld, World
+
+CONFIG = {
+    "world": None,  # an .imu file; None: at rest for ever
+    "board": {},  # what board.py says otherwise
+    "seconds": 10,  # of simulated time
+    "frame_ms": 0,  # 0: no pictures; else the display's every so many ms
+    "out": None,  # a file for the attitude after every step: world row, then 4 int32 (Q29)
+    "imu": True,  # False: no sensor on the bus
+    "who_am_i": 0x68,
+    "display": True,
+    "irq_cost_us": 0,  # what the tick's code takes, beside its bus time
+    "faults": [],  # [at_us, "imu" or "display" or "bus", method, arguments...]: what goes wrong, and when
+}
+
+
+class Faults:
+    """Calls a simulated part's method at its time: vanish, come_back, brown_out, nack_next, ..."""
+
+    def __init__(self, faults, parts):
+        self._faults = sorted(faults)
+        self._parts = parts
+
+    def due(self):
+        return self._faults[0][0] if self._faults else None
+
+    def fire(self, now):
+        fault = self._faults.pop(0)
+        part, method = self._parts[fault[1]], fault[2]
+        if method == "stuck":
+            part.stuck = fault[3]
+        else:
+            getattr(part, method)(*fault[3:])
+
+
+class Frames:
+    """Shows the host what the display shows, every so often."""
+
+    def __init__(self, chip, every_ms):
+        self._chip = chip
+        self._every = every_ms * 1000
+        self._at = 0
+        self._last = None
+
+    def due(self):
+        return self._at
+
+    def fire(self, now):
+        self._at += self._every
+        picture = bytes(self._chip.frame())
+        if picture != self._last:
+            self._last = picture
+            print("\tframe", now, str(hexlify(picture), "ascii"))
+        else:
+            print("\ttime", now)
+
+
+class Recorder:
+    """The attitude after every step, with the row of the world that it belongs to."""
+
+    def __init__(self, path, world, chip):
+        self._file = open(path, "wb")  # noqa: SIM115  (open until the end of the run)
+        self._world = world
+        self._chip = chip
+        self._row = array("i", [0] * 5)
+        self._q = array("i", [0] * 4)
+        self._steps = 0
+        self.main = {}
+
+    def after_irq(self):
+        app = self.main.get("application")
+        if app is None or app.tick is None or app.tick.steps == self._steps:
+            return
+        self._steps = app.tick.steps
+        app.filter.quaternion(self._q)
+        self._row[0] = self._world.index_at(self._chip._sample_us)
+        for i in range(4):
+            self._row[1 + i] = self._q[i]
+        self._file.write(self._row)
+
+    def close(self):
+        self._file.close()
+
+
+def main():
+    config = dict(CONFIG)
+    config.update(json.loads(sys.argv[1]))
+    machine.power_on()
+    world = World(config["world"]) if config["world"] else StillWorld()
+    world.start(0)
+    chip = MPU6050Chip(world, who_am_i=config["who_am_i"])
+    oled = SSD1306Chip()
+    buses = [machine.I2C(0)._bus, machine.I2C(1)._bus]
+    if config["imu"]:
+        machine.wire_i2c(0, chip)
+        machine.wire_pin(6, chip)
+    if config["display"]:
+        machine.wire_i2c(0 if config["board"].get("DISPLAY_SHARES_BUS", True) else 1, oled)
+    parts = {"imu": chip, "display": oled, "bus": buses[0]}
+    kernel.add_source(Faults(config["faults"], parts))
+    if config["frame_ms"]:
+        kernel.add_source(Frames(oled, config["frame_ms"]))
+    recorder = Recorder(config["out"], world, chip) if config["out"] else None
+    if recorder:
+        kernel.after_irq = recorder.after_irq
+    kernel.irq_cost_us = config["irq_cost_us"]
+    kernel.stop_at(int(config["seconds"] * 1000000))
+
+    import board
+
+    for name, value in config["board"].items():
+        setattr(board, name, tuple(value) if isinstance(value, list) else value)
+    program = {"__name__": "__main__"}
+    if recorder:
+        recorder.main = program
+    try:
+        execute("boot.py", {"__name__": "__main__"})
+        execute("main.py", program)
+    except kernel.PowerOff:
+        pass
+    except kernel.Reset as reset:
+        print("reset, cause", reset.args[0])
+    finish(program.get("application"), recorder, buses, oled)
+
+
+def execute(name, namespace):
+    """Run a file of the board's root, as the interpreter does when it starts."""
+    for folder in sys.path:
+        try:
+            with open(folder + "/" + name) as file:
+                exec(compile(file.read(), name, "exec"), namespace)
+                return
+        except OSError:
+            pass
+    raise OSError("no %s on the path" % name)
+
+
+def finish(app, recorder, buses, oled):
+    result = {
+        "ended_us": kernel.now(),
+        "irqs": kernel.irq_count,
+        "cuts": sum([bus.cuts for bus in buses]),
+        "bus_bytes": [bus.bytes for bus in buses],
+        "display_misuse": oled.errors,
+        "uncaught": len(kernel.uncaught),
+        "heap_checked": sys.implementation.name == "micropython",
+        "started": False,
+    }
+    if app is not None and app.tick is not None:
+        tick, imu = app.tick, app.imu
+        result["started"] = True
+        result["steps"] = tick.steps
+        result["fresh"] = tick.fresh
+        result["missed"] = tick.missed
+        result["crashes"] = tick.crashes
+        result["error"] = repr(tick.error) if tick.error else None
+        result["errors"] = imu.errors
+        result["resets"] = imu.resets
+        result["fifo_overflows"] = imu.fifo_overflows
+        result["bias_known"] = app.bias_known
+        result["angles_mdeg"] = list(app.angles)
+        result["ticker"] = app.ticker.what
+        result["display_errors"] = app.display.errors if app.display else None
+        result["chip"] = imu.chip
+    if recorder:
+        recorder.close()
+    print("\tresult", json.dumps(result))
+
+
+main()

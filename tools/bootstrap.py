@@ -1,0 +1,73 @@
+"""Makes .venv with everything that the host side needs: `make setup`. Standard library only, no root needed.
+
+A Debian without python3-venv has no pip to put into a virtual environment: then the wheel of Debian's python3-pip-whl
+is fetched beside it, without touching the system.
+"""
+
+import importlib.util
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+VENV = ROOT / ".venv"
+STAMP = VENV / ".upright-setup"
+PYTHON = VENV / "bin" / "python"
+SOURCES = (ROOT / "pyproject.toml", ROOT / "tools" / "constraints.txt", Path(__file__))
+
+
+def fail(message):
+    sys.exit(f"setup: {message}")
+
+
+def stamp():
+    """What the environment was made from."""
+    return "\n".join([sys.version, str(ROOT), *(source.read_text() for source in SOURCES)])
+
+
+def pip_wheel(folder):
+    """-> pip's wheel out of Debian's package."""
+    sys.path.insert(0, str(ROOT / "tools"))
+    from upright.debian import Apt, AptError
+
+    print("setup: no ensurepip here (python3-venv is not installed): fetching pip's wheel from Debian")
+    try:
+        native = subprocess.run(
+            ["dpkg", "--print-architecture"], capture_output=True, text=True, check=True
+        ).stdout.strip()
+        apt = Apt(folder, [native])
+        apt.run("apt-get", "update")
+        apt.download(["python3-pip-whl:all"], lambda percent, text: None)
+        apt.unpack(["python3-pip-whl:all"], folder / "unpacked")
+        (wheel,) = (folder / "unpacked").glob("usr/share/python-wheels/pip-*.whl")
+    except (AptError, OSError, ValueError, subprocess.CalledProcessError) as why:
+        fail(f"cannot get pip ({why}). Install Debian's python3-venv and try again.")
+    return wheel
+
+
+def make():
+    if sys.version_info < (3, 11):
+        fail(f"needs Python 3.11 or newer, this is {sys.version.split()[0]}")
+    print(f"setup: making {VENV.name} with Python {sys.version.split()[0]}", flush=True)
+    has_pip = importlib.util.find_spec("ensurepip") is not None
+    venv = [sys.executable, "-m", "venv", "--clear", str(VENV)]
+    if subprocess.run(venv if has_pip else [*venv, "--without-pip"]).returncode:
+        fail("python3 -m venv failed, see above")
+    print("setup: installing the host side's packages", flush=True)
+    install = ["install", "--disable-pip-version-check", "-c", str(ROOT / "tools/constraints.txt")]
+    install += ["-e", f"{ROOT}[test]"]
+    with tempfile.TemporaryDirectory() as folder:
+        pip = [str(PYTHON), "-m", "pip"] if has_pip else [str(PYTHON), f"{pip_wheel(Path(folder))}/pip"]
+        if not has_pip and subprocess.run([*pip, "install", "-q", "pip"]).returncode:
+            fail("pip could not be installed, see above")
+        if subprocess.run([str(PYTHON), "-m", "pip", *install], env=os.environ).returncode:
+            fail("pip could not install the packages, see above")
+    STAMP.write_text(stamp())
+    print("setup: done; .venv/bin/upright --help", flush=True)
+
+
+if __name__ == "__main__":
+    if not STAMP.exists() or STAMP.read_text() != stamp():
+        make()

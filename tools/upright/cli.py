@@ -1,0 +1,177 @@
+"""The command line `upright`."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from upright import __version__, runtimes
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, rich_markup_mode="rich")
+console = Console()
+
+
+def _version(show: bool):
+    if show:
+        print(f"upright {__version__}")
+        raise typer.Exit()
+
+
+@app.callback()
+def main_options(
+    version: bool = typer.Option(
+        False, "--version", callback=_version, is_eager=True, help="Show the version and stop."
+    ),
+):
+    """Attitude (roll, pitch, yaw) for MicroPython: simulate, replay, score."""
+
+
+@app.command("runtimes")
+def list_runtimes():
+    """Obtain and list the interpreters that the portable code is tested on."""
+    runtimes.obtain_all()
+    table = Table(box=None, pad_edge=False)
+    for column in ("runtime", "version", "what"):
+        table.add_column(column)
+    for name in runtimes.NAMES:
+        try:
+            _, version = runtimes.interpreter(name)
+            table.add_row(name, version, runtimes.what(name))
+        except runtimes.Unavailable as why:
+            table.add_row(name, "-", f"not here: {why}")
+    console.print(table)
+
+
+@app.command(
+    "exec", context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False}
+)
+def exec_file(
+    file: Path = typer.Argument(..., help="The script to run.", exists=True, dir_okay=False),
+    args: list[str] = typer.Argument(None, help="What the script finds in sys.argv[1:]."),
+    runtime: str = typer.Option("unix", "--runtime", help="cpython, unix, unix32 or arm."),
+    board: str = typer.Option("sim", help="The board folder on the search path."),
+):
+    """Run a file on a runtime, with the simulated board's modules on its search path."""
+    try:
+        argv, environment = runtimes.command(runtime, file, args or (), board)
+    except runtimes.Unavailable as why:
+        console.print(f"runtime {runtime} cannot be had here: {why}", style="red")
+        raise typer.Exit(3) from None
+    raise typer.Exit(subprocess.run(argv, env=environment).returncode)
+
+
+_RUNTIME = "cpython, unix, unix32 or arm"
+
+
+def _fail(message: str, code: int = 2):
+    console.print(message, style="red", highlight=False, markup=False)
+    raise typer.Exit(code)
+
+
+def _positive(seconds: float | None):
+    if seconds is not None and not seconds > 0:
+        raise typer.BadParameter(f"{seconds} is not a positive number of seconds")
+    return seconds
+
+
+@app.command("demo")
+def demo_command(
+    trial: Path = typer.Option(None, help="Feed this recorded trial (.npz) through the chip."),
+    motion: str = typer.Option("demo", help="Synthetic motion, when there is no --trial."),
+    headless: bool = typer.Option(
+        False, help="No live display: progress, the last picture, the figures."
+    ),
+    seconds: float = typer.Option(
+        None, callback=_positive, help="Simulated time (25; of a trial, all of it)."
+    ),
+    speed: float = typer.Option(None, min=0, help="Times real time; 0: as fast as it goes."),
+    png: Path = typer.Option(None, help="Save the display's last picture."),
+    gif: Path = typer.Option(None, help="Save all that the display showed as an animation."),
+    runtime: str = typer.Option(None, help=f"{_RUNTIME} (default: unix where it can be had)."),
+):
+    """Boot the firmware on the simulated board: MPU6050, filter in a hard timer tick, OLED; and how far off it was."""
+    from upright import demo, simulate, trials
+
+    try:
+        source = demo.trial_source(trial, seconds) if trial else demo.motion_source(motion, seconds)
+        runtime = runtime or simulate.best_runtime()
+        outcome = demo.show(source, runtime, headless, speed, console)
+        for line in demo.summary(outcome):
+            console.print(line, highlight=False, soft_wrap=True)
+        if png:
+            demo.save_png(outcome, png)
+            console.print("picture:", png)
+        if gif:
+            demo.save_gif(outcome, gif)
+            console.print("animation:", gif)
+    except (trials.TrialError, ValueError) as why:
+        _fail(str(why))
+    except runtimes.Unavailable as why:
+        _fail(f"runtime {runtime} cannot be had here: {why}", 3)
+    except (simulate.SimulationError, OSError) as why:
+        _fail(str(why), 1)
+    r = outcome.result
+    if not r["started"] or r["crashes"] or r["uncaught"]:
+        raise typer.Exit(1)
+
+
+@app.command("replay")
+def replay_command(
+    trial: Path = typer.Argument(..., help="Recorded trial, .npz."),
+    filter: str = typer.Option("mahony6", help="The filter."),
+    runtime: str = typer.Option("cpython", help=_RUNTIME + "."),
+    out: Path = typer.Option(None, help="Write rows t,q0,q1,q2,q3 to this CSV file."),
+    seconds: float = typer.Option(None, callback=_positive, help="Only the first so many seconds."),
+    kp: float = typer.Option(0.5, help="Proportional gain, rad/s."),
+    ki: float = typer.Option(0.0, help="Integral gain, rad/s^2."),
+    direct: bool = typer.Option(
+        False, help="Counts straight into the filter, past chip and driver."
+    ),
+):
+    """Replay a recorded trial through the simulated chip's registers, the driver, the tick and a filter; score it."""
+    from rich.progress import Progress
+
+    from upright import replay, scoring, simulate, trials
+
+    try:
+        loaded = trials.load(trial)
+        with Progress(console=Console(stderr=True)) as progress:
+            task = progress.add_task(f"{loaded.name} on {runtime}", total=loaded.rows(seconds))
+            done = replay.replay(
+                loaded,
+                filter,
+                runtime,
+                seconds,
+                {"kp": kp, "ki": ki},
+                direct,
+                lambda at, of: progress.update(task, completed=at),
+            )
+            progress.update(task, completed=len(done.q29))
+        if out:
+            scoring.write_csv(out, done.q29, loaded.rate)
+    except trials.TrialError as why:
+        _fail(str(why))
+    except runtimes.Unavailable as why:
+        _fail(f"runtime {runtime} cannot be had here: {why}", 3)
+    except (simulate.SimulationError, OSError, ValueError) as why:
+        _fail(str(why), 1)
+    how = (
+        "counts straight into the filter" if direct else "through the chip's registers and the tick"
+    )
+    console.print(f"{loaded.name}: {len(done.q29)} samples, {filter}, {how}", highlight=False)
+    if done.score is None:
+        console.print("no truth in this trial: nothing to score")
+    else:
+        for line in done.score.lines():
+            console.print(line, highlight=False)
+
+
+def main():
+    app()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,77 @@
+"""Runs the simulator's scripts on a runtime and follows what they say: the console, progress, pictures, the result."""
+
+import json
+import subprocess
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from upright import paths, runtimes
+
+REPLAY = paths.SIM / "run_replay.py"
+FIRMWARE = paths.SIM / "run_firmware.py"
+
+
+class SimulationError(RuntimeError):
+    """The script did not run to its end; the message holds the last lines that it said."""
+
+
+def best_runtime() -> str:
+    """The quickest runtime that checks for allocation, else cpython."""
+    try:
+        runtimes.interpreter("unix")
+        return "unix"
+    except runtimes.Unavailable:
+        return "cpython"
+
+
+def run(runtime: str, script: Path, config: dict, on_event=None) -> dict:
+    """Run a script of host_tests/sim with its configuration; -> its result.
+
+    on_event(kind, fields) is called for every line: kind is "console" (fields: [line]) or the first word of a line
+    that the script meant for the host ("frame", "time", "at"), with the other words in fields.
+    Raises SimulationError, and runtimes.Unavailable.
+    """
+    argv, environment = runtimes.command(runtime, script, [json.dumps(config)])
+    result, said = None, []
+    with (
+        tempfile.TemporaryFile("w+") as errors,
+        subprocess.Popen(
+            argv, env=environment, stdout=subprocess.PIPE, stderr=errors, text=True, bufsize=1
+        ) as process,
+    ):
+        try:
+            for line in process.stdout:
+                line = line.rstrip("\n")
+                if not line.startswith("\t"):
+                    said.append(line)
+                    if on_event:
+                        on_event("console", [line])
+                    continue
+                kind, _, rest = line[1:].partition(" ")
+                if kind == "result":
+                    result = json.loads(rest)
+                elif on_event:
+                    on_event(kind, rest.split(" "))
+        except BaseException:
+            process.kill()
+            raise
+        code = process.wait()
+        errors.seek(0)
+        tail = errors.read().strip().splitlines()[-8:]
+    if code or result is None:
+        lines = "\n".join(said[-4:] + tail)
+        raise SimulationError(f"{script.name} on {runtime} ended with {code}:\n{lines}")
+    return result
+
+
+def read_attitudes(path: Path) -> np.ndarray:
+    """What run_replay.py wrote: int32 (n, 4), Q29."""
+    return np.fromfile(path, "<i4").reshape(-1, 4)
+
+
+def read_steps(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """What run_firmware.py wrote -> (world row of each step (n,), attitudes int32 (n, 4), Q29)."""
+    rows = np.fromfile(path, "<i4").reshape(-1, 5)
+    return rows[:, 0], rows[:, 1:]
