@@ -1,0 +1,618 @@
+"""The OLED writer: drawing against a naive reference, numbers against Python's, and the way to the glass."""
+
+import sys
+from decimal import ROUND_HALF_UP, Decimal
+
+import machine
+import pytest
+import ssd1306
+from chips.ssd1306 import SSD1306Chip
+from conftest import require
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from ssd1306 import BLACK, INVERSE, LARGE, OPAQUE, SMALL, TALL, WHITE, XOR
+from upright import oled
+
+QUICK = settings(max_examples=150, deadline=None)
+COLOURS = st.sampled_from((BLACK, WHITE, XOR))
+PLACES = st.integers(-70, 150)
+SIZES = st.sampled_from((SMALL, LARGE, TALL))
+
+
+class ChipBus:
+    """The shortest way from the writer to the chip: a bus for I2C and for SPI, which counts."""
+
+    def __init__(self, chip):
+        self.chip = chip
+        self.sent = 0  # data bytes, without control bytes
+        self.longest = 0
+
+    def writeto(self, address, data):
+        chip = self.chip
+        if data[0] == 0x40:
+            self.sent += len(data) - 1
+        self.longest = max(self.longest, len(data) - 1)
+        try:
+            if address != chip.address or not chip.i2c_start(False, 0):
+                raise OSError(5)
+            for byte in data:
+                if not chip.i2c_write(byte, 0):
+                    raise OSError(5)
+        finally:
+            chip.i2c_stop(0)
+
+
+def bench(begin=True, width=128, height=64, sh1106=False, address=0x3C, **options):
+    chip = SSD1306Chip(address=address, width=width, height=height, sh1106=sh1106)
+    bus = ChipBus(chip)
+    options.setdefault("column_offset", chip.first_segment)
+    display = ssd1306.SSD1306_I2C(bus, width, height, sh1106=sh1106, **options)
+    if begin:
+        display.begin()
+    return chip, bus, display
+
+
+def canvas():
+    return ssd1306.Canvas(128, 64)
+
+
+def rows(display):
+    return oled.rows_of_frame(display.buffer, display.width)
+
+
+# ---------------------------------------------------------------- drawing
+
+
+class Reference:
+    """Pixel by pixel, in a dict as large as it needs to be."""
+
+    def __init__(self):
+        self.lit = set()
+
+    def pixel(self, x, y, colour):
+        if colour == BLACK or (colour == XOR and (x, y) in self.lit):
+            self.lit.discard((x, y))
+        else:
+            self.lit.add((x, y))
+
+    def fill_rect(self, x, y, w, h, colour):
+        for i in range(x, x + w):
+            for j in range(y, y + h):
+                self.pixel(i, j, colour)
+
+    def rect(self, x, y, w, h, colour):
+        edge = {(i, j) for i in range(x, x + w) for j in range(y, y + h)}
+        edge -= {(i, j) for i in range(x + 1, x + w - 1) for j in range(y + 1, y + h - 1)}
+        for i, j in edge:
+            self.pixel(i, j, colour)
+
+    def rows(self, width=128, height=64):
+        return [bytearray((x, y) in self.lit for x in range(width)) for y in range(height)]
+
+
+RECTANGLES = st.tuples(
+    st.sampled_from(("fill_rect", "rect")),
+    PLACES,
+    PLACES,
+    st.integers(0, 160),
+    st.integers(0, 80),
+    COLOURS,
+)
+
+
+@QUICK
+@given(st.lists(RECTANGLES, max_size=4))
+def test_rectangles_are_those_of_the_reference_and_clipped(shapes):
+    d, reference = canvas(), Reference()
+    for name, *arguments in shapes:
+        getattr(d, name)(*arguments)
+        getattr(reference, name)(*arguments)
+    assert rows(d) == reference.rows()
+
+
+@QUICK
+@given(PLACES, PLACES, st.integers(0, 160), COLOURS)
+def test_lines_along_the_axes_and_pixels_are_rectangles(x, y, n, colour):
+    d, reference = canvas(), canvas()
+    d.hline(x, y, n, colour)
+    d.vline(y, x, n, colour)
+    d.pixel(y, y, colour)
+    reference.fill_rect(x, y, n, 1, colour)
+    reference.fill_rect(y, x, 1, n, colour)
+    reference.fill_rect(y, y, 1, 1, colour)
+    assert d.buffer == reference.buffer
+
+
+@QUICK
+@given(PLACES, PLACES, PLACES, PLACES)
+def test_a_line_stays_within_half_a_pixel_of_the_true_one(x0, y0, x1, y1):
+    d = canvas()
+    d.line(x0, y0, x1, y1)
+    long = max(abs(x1 - x0), abs(y1 - y0))
+    wanted = set()
+    for i in range(long + 1):
+        # along the longer axis one pixel a step, the other coordinate rounded
+        x = x0 + (x1 - x0) * i / long if long else x0
+        y = y0 + (y1 - y0) * i / long if long else y0
+        wanted.add((x, y))
+    lit = {(x, y) for y, row in enumerate(rows(d)) for x, v in enumerate(row) if v}
+    inside = {(x, y) for x, y in wanted if -0.5 <= x <= 127.5 and -0.5 <= y <= 63.5}
+    assert len(lit) >= len({p for p in wanted if 0 <= p[0] <= 127 and 0 <= p[1] <= 63})
+    for x, y in lit:
+        assert any(abs(x - a) <= 0.5 and abs(y - b) <= 0.5 for a, b in inside)
+
+
+def test_a_far_line_crosses_the_display():
+    d = canvas()
+    d.line(-8000, 32, 8000, 32)
+    assert rows(d)[32] == bytearray([1] * 128) and sum(map(sum, rows(d))) == 128
+
+
+@QUICK
+@given(
+    st.text(st.characters(min_codepoint=32, max_codepoint=126) | st.just("\u00b0"), max_size=8),
+    PLACES,
+    PLACES,
+    SIZES,
+    st.sampled_from((BLACK, WHITE, XOR, OPAQUE, INVERSE)),
+    st.booleans(),
+)
+def test_text_is_the_same_picture_anywhere_and_clipped(text, x, y, size, colour, light):
+    """Drawn in the middle of a large reference made of single characters at (0, 0)."""
+    d, reference = canvas(), Reference()
+    if light:
+        d.fill(WHITE)
+        reference.fill_rect(0, 0, 128, 64, WHITE)
+    end = d.text(text, x, y, size, colour)
+    at = x
+    for character in text:
+        cell = canvas()
+        w = cell.text(character, 0, 0, size, WHITE)
+        h = 8 if size == SMALL else 16
+        glyph = rows(cell)
+        for i in range(w):
+            for j in range(h):
+                lit = glyph[j][i]
+                if colour == OPAQUE:
+                    reference.pixel(at + i, y + j, WHITE if lit else BLACK)
+                elif colour == INVERSE:
+                    reference.pixel(at + i, y + j, BLACK if lit else WHITE)
+                elif lit:
+                    reference.pixel(at + i, y + j, colour)
+        at += w
+    assert end == at == x + d.text_width(text, size)
+    assert rows(d) == reference.rows()
+
+
+def test_every_character_has_a_picture_of_its_own():
+    for size in (SMALL, LARGE, TALL):
+        seen = {}
+        for character in [*map(chr, range(32, 127)), "\u00b0"]:
+            d = canvas()
+            d.text(character, 0, 0, size)
+            seen.setdefault(bytes(d.buffer), []).append(character)
+        assert [group for group in seen.values() if len(group) > 1] == []
+
+
+@pytest.mark.parametrize("strange", ["\t", "\u007f", "\u00e9", "\u20ac", "\U0001f600"])
+def test_a_character_that_the_font_lacks_is_a_question_mark(strange):
+    d, reference = canvas(), canvas()
+    d.text(strange + "1", 0, 0)
+    reference.text("?1", 0, 0)
+    assert d.buffer == reference.buffer
+
+
+def test_text_takes_bytes_one_character_each():
+    d, reference = canvas(), canvas()
+    d.text(b"5\xb0", 0, 0)
+    reference.text("5\u00b0", 0, 0)
+    assert d.buffer == reference.buffer
+    assert d.text("5\u00b0".encode(), 0, 0) == 18, "three bytes"
+
+
+# ---------------------------------------------------------------- numbers
+
+
+def as_python_formats(value, width, decimals, point, sign):
+    """The same number by Python's own means, halves away from zero, no minus zero."""
+    step = Decimal(1).scaleb(-decimals)
+    rounded = Decimal(value).scaleb(-point).quantize(step, ROUND_HALF_UP)
+    if rounded == 0:
+        rounded = abs(rounded)
+    text = format(rounded, f"{'+' if sign else ''}{width or ''}.{decimals}f")
+    return text if len(text) <= width or not width else "#" * width
+
+
+@settings(max_examples=500, deadline=None)
+@given(
+    st.integers(-(2**30), 2**30) | st.integers(-2000, 2000),
+    st.integers(0, 24),
+    st.integers(0, 9),
+    st.data(),
+    st.booleans(),
+    SIZES,
+)
+def test_numbers_are_as_python_formats_them(value, width, point, data, sign, size):
+    decimals = data.draw(st.integers(0, point))
+    d, reference = ssd1306.Canvas(128, 16), ssd1306.Canvas(128, 16)
+    end = d.number(value, 0, 0, size, width, decimals, point, sign)
+    text = as_python_formats(value, width, decimals, point, sign)
+    assert reference.text(text, 0, 0, size) == end, text
+    assert d.buffer == reference.buffer, text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (-123456, "-123.5"),
+        (-49, "0.0"),
+        (-50, "-0.1"),
+        (49, "0.0"),
+        (50, "0.1"),
+        (999949, "999.9"),
+        (999950, "1000.0"),
+    ],
+)
+def test_millidegrees_with_one_decimal(value, text):
+    d, reference = canvas(), canvas()
+    d.number(value, 3, 5, SMALL, 0, 1, 3)
+    reference.text(text, 3, 5)
+    assert d.buffer == reference.buffer
+
+
+# ---------------------------------------------------------------- set-up
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        {},
+        {"height": 32},
+        {"sh1106": True},
+        {"width": 64, "height": 48},
+        {"width": 16, "height": 16},
+        {"rotate": 180},
+        {"sh1106": True, "rotate": 180},
+        {"height": 32, "rotate": 180},
+        {"chunk": 128},
+        {"chunk": 8},
+    ],
+)
+def test_every_kind_of_panel_shows_the_buffer(kind):
+    chip, _bus, d = bench(**kind)
+    assert chip.lit and not any(chip.frame()), "cleared before it was lit"
+    d.text("Wy\u00b0", 1, 1, LARGE)
+    d.fill_rect(d.width - 3, d.height - 2, 3, 2)
+    d.show()
+    assert d.flush()
+    seen = chip.picture()
+    if "rotate" in kind:
+        seen = [row[::-1] for row in seen[::-1]]
+    assert seen == rows(d) and chip.errors == []
+
+
+def test_the_wrong_kind_of_controller_is_not_forgiven():
+    """The failing twin: an SH1106 behind a display object for the SSD1306."""
+    chip = SSD1306Chip(sh1106=True)
+    d = ssd1306.SSD1306_I2C(ChipBus(chip))
+    d.begin()
+    assert chip.errors
+
+
+def test_spi_with_reset_and_chip_select_through_the_machine():
+    chip = SSD1306Chip()
+    machine.wire_spi(1, chip, cs=5, dc=6, rst=7)
+    pins = [machine.Pin(n, machine.Pin.OUT) for n in (6, 7, 5)]
+    d = ssd1306.SSD1306_SPI(machine.SPI(1, baudrate=10_000_000), *pins)
+    d.begin()
+    d.text("SPI", 10, 20, LARGE)
+    d.show()
+    assert d.flush()
+    assert chip.picture() == rows(d) and chip.errors == []
+
+
+def test_spi_without_chip_select_and_reset():
+    chip = SSD1306Chip()
+    machine.wire_spi(1, chip, dc=6)
+    d = ssd1306.SSD1306_SPI(machine.SPI(1, baudrate=1_000_000), machine.Pin(6, machine.Pin.OUT))
+    d.begin()
+    assert chip.lit and chip.errors == []
+
+
+def test_i2c_through_the_machine_takes_the_time_that_the_docstring_says():
+    import kernel
+
+    chip = SSD1306Chip()
+    machine.wire_i2c(0, chip)
+    d = ssd1306.SSD1306_I2C(machine.I2C(0, freq=400_000), refresh=False)
+    d.begin()
+    d.fill(1)
+    d.show()
+    before = kernel.now()
+    d.flush_step(32)
+    took = kernel.now() - before
+    assert 39 * 9 * 2.5 <= took <= 39 * 9 * 2.5 + 60
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"width": 130}, "width"),
+        ({"width": 136}, "width"),
+        ({"height": 12}, "height"),
+        ({"height": 8}, "height"),
+        ({"height": 72}, "height"),
+        ({"chunk": 0}, "chunk"),
+        ({"chunk": 33}, "chunk"),
+        ({"rotate": 90}, "rotate"),
+    ],
+)
+def test_what_cannot_be_is_refused(options, words):
+    with pytest.raises(ValueError, match=words):
+        ssd1306.SSD1306_I2C(None, **options)
+
+
+def test_an_absent_display_is_a_clear_error():
+    _chip, _bus, d = bench(begin=False, address=0x3D)
+    with pytest.raises(OSError, match=r"0x3C.*0x3D") as why:
+        d.begin()
+    assert isinstance(why.value, ssd1306.DisplayError)
+    assert d.lost and not d.busy
+
+
+@pytest.mark.parametrize("after", range(0, 40, 3))
+def test_a_display_that_is_lost_during_set_up_is_an_error(after):
+    chip, _bus, d = bench(begin=False)
+    chip.nack_next(100, after=after)
+    with pytest.raises(ssd1306.DisplayError):
+        d.begin()
+
+
+def test_a_display_that_appears_later_is_set_up_by_itself():
+    chip, _bus, d = bench(begin=False)
+    chip.vanish()
+    with pytest.raises(ssd1306.DisplayError):
+        d.begin()
+    d.text("late", 0, 0)
+    for _ in range(3):
+        assert d.show() and not d.flush()
+    chip.come_back()
+    assert d.show() and d.flush()
+    assert chip.lit and chip.picture() == rows(d) and not d.lost
+
+
+# ---------------------------------------------------------------- contrast, inverse, power
+
+
+def test_contrast_inverse_and_power_come_with_the_next_frame():
+    chip, _bus, d = bench(contrast=0x20)
+    assert chip.contrast == 0x20
+    d.contrast(300)
+    d.invert(True)
+    assert chip.contrast == 0x20, "nothing on the bus before show()"
+    d.show()
+    d.flush()
+    assert chip.contrast == 300 & 255 and chip.inverse and chip.lit
+    d.power(False)
+    d.show()
+    d.flush()
+    assert not chip.lit
+    d.power(True)
+    d.invert(False)
+    d.show()
+    d.flush()
+    assert chip.lit and not chip.inverse and chip.errors == []
+
+
+# ---------------------------------------------------------------- flushing
+
+
+def test_what_did_not_change_is_not_sent():
+    _chip, bus, d = bench(refresh=False)
+    d.number(1234, 0, 0, LARGE, 6, 1, 3)
+    d.show()
+    d.flush()
+    before = bus.sent
+    d.fill(0)
+    d.number(1234, 0, 0, LARGE, 6, 1, 3)
+    assert d.show() and not d.busy
+    assert bus.sent == before
+    d.number(1334, 0, 0, LARGE, 6, 1, 3)
+    d.show()
+    d.flush()
+    assert 0 < bus.sent - before <= 48, "one digit of two pages"
+
+
+@QUICK
+@given(st.integers(0, 300), st.sampled_from((8, 16, 32, 64, 128)))
+def test_a_step_never_sends_more_than_it_may(limit, chunk):
+    _chip, bus, d = bench(chunk=chunk)
+    for x in range(0, 128, 5):
+        d.vline(x, 0, 64)
+    d.contrast(1)
+    d.show()
+    left = d._left
+    for _ in range(400):
+        if not d.busy:
+            break
+        bus.sent = bus.longest = 0
+        new = d.flush_step(limit)
+        assert bus.sent <= limit and bus.longest <= max(min(limit, chunk), 8)
+        assert new <= left - (8 if limit >= 8 else 0)
+        left = new
+    assert d.busy == (limit < 8)
+    assert left == 0 or limit < 8
+
+
+DRAWINGS = st.one_of(
+    RECTANGLES,
+    st.tuples(st.just("text"), st.text("0123ab\u00b0", max_size=6), PLACES, PLACES, SIZES),
+    st.tuples(st.just("line"), PLACES, PLACES, PLACES, PLACES, COLOURS),
+)
+STEPS = st.lists(
+    st.one_of(
+        DRAWINGS,
+        st.tuples(st.just("show")),
+        st.tuples(st.just("flush_step"), st.integers(0, 64)),
+        st.tuples(st.just("nack"), st.integers(1, 12), st.integers(0, 60)),
+        st.tuples(st.just("brown-out")),
+        st.tuples(st.just("contrast"), st.integers(0, 255)),
+    ),
+    max_size=40,
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(STEPS, st.booleans(), st.sampled_from((8, 32)))
+def test_whatever_happens_the_display_comes_to_show_the_buffer(steps, sh1106, chunk):
+    chip, _bus, d = bench(sh1106=sh1106, chunk=chunk)
+    for name, *arguments in steps:
+        if name == "nack":
+            chip.nack_next(arguments[0], after=arguments[1])
+        elif name == "brown-out":
+            chip.vanish()
+            d.fill_rect(0, 0, 9, 9, XOR)
+            d.show()
+            d.flush()
+            chip.come_back()
+        else:
+            getattr(d, name)(*arguments)
+    chip.nack_next(0)
+    # the frame under way, then the buffer; when a frame was given up, once more to be set up again
+    for _ in range(3):
+        d.flush()
+        assert d.show()
+    d.flush()
+    assert not d.busy and not d.lost
+    assert chip.lit and chip.picture() == rows(d)
+    assert bytes(d._sent) == bytes(d.buffer)
+
+
+def test_failures_are_counted_and_the_frame_given_up_at_last():
+    chip, _bus, d = bench()
+    d.fill(1)
+    d.show()
+    left = d.flush_step(32)
+    chip.nack_next(3)
+    assert [d.flush_step(32) for _ in range(3)] == [left] * 3, "sent again, not skipped"
+    assert (d.errors, d.dropped, d.lost) == (3, 0, False)
+    assert d.flush() and chip.picture() == rows(d)
+    chip.vanish()
+    d.fill(0)
+    d.show()
+    calls = 0
+    while d.flush_step(32):
+        calls += 1
+    assert calls == 7 and not d.busy
+    assert (d.errors, d.dropped, d.lost) == (11, 1, True)
+    d.show()
+    assert d.flush_step(32) == 0 and d.errors == 12, "one attempt a frame while it is away"
+
+
+def test_a_short_loss_of_power_between_frames_heals():
+    chip, _bus, d = bench()
+    d.text("still here", 0, 0)
+    d.show()
+    d.flush()
+    chip.vanish()
+    chip.come_back()  # it answers again before anyone noticed
+    frames = 0
+    while not (chip.lit and chip.picture() == rows(d)):
+        d.show()
+        d.flush()
+        frames += 1
+        assert frames <= 2 * 128, "one turn over the blocks and one for what came before"
+    assert d.errors == 0
+
+
+def test_without_refresh_it_does_not():
+    """The failing twin."""
+    chip, _bus, d = bench(refresh=False)
+    chip.vanish()
+    chip.come_back()
+    for _ in range(300):
+        d.show()
+        d.flush()
+    assert not chip.lit
+
+
+def test_an_interrupt_that_flushes_may_come_anywhere_in_show_and_drawing():
+    """flush_step() called between any two lines of the main program, as a hard tick does."""
+    lines = None
+    at = 0
+    while lines is None or at < lines:
+        chip, _bus, d = bench(width=16, height=16, chunk=8)
+        d.fill_rect(0, 0, 16, 9)
+        d.show()
+        d.flush_step(8)
+        lines = interrupt_after(at, d)
+        d.flush()
+        d.show()
+        assert d.flush() and chip.picture() == rows(d), f"interrupted at line {at}"
+        assert bytes(d._sent) == bytes(d.buffer) and d.errors == 0
+        at += 1
+    assert lines > 100
+
+
+def interrupt_after(count, d):
+    """Draw and show, with two steps of a flush after so many lines -> lines in all."""
+    seen = 0
+
+    def line(frame, event, argument):
+        nonlocal seen
+        if event == "line":
+            if seen == count:
+                sys.settrace(None)
+                d.flush_step(16)
+                d.flush_step(16)
+                sys.settrace(call)
+            seen += 1
+        return line
+
+    def call(frame, event, argument):
+        return line if "ssd1306" in frame.f_code.co_filename else None
+
+    sys.settrace(call)
+    try:
+        d.show()
+        d.text("%", 3, 3)
+        d.show()
+        d.line(0, 0, 15, 15, XOR)
+    finally:
+        sys.settrace(None)
+    return seen
+
+
+def test_drawing_while_a_frame_is_sent_does_not_reach_the_display():
+    chip, _bus, d = bench(chunk=8)
+    d.fill(1)
+    d.show()
+    shown = bytes(d.buffer)
+    while d.flush_step(8):
+        d.fill_rect(0, 0, 60, 60, XOR)
+        assert not d.show(), "not before the last frame is out"
+    assert chip.frame() == shown
+
+
+# ---------------------------------------------------------------- allocation
+
+
+def results(printed):
+    """name -> the words after it."""
+    return {line.split()[0]: line.split()[1:] for line in printed.splitlines()}
+
+
+def test_ten_thousand_pieces_allocate_nothing(micropython_runtime, portable):
+    seen = results(portable(micropython_runtime, "ssd1306_alloc.py"))
+    assert sorted(seen) == ["i2c-free", "i2c-locked", "spi-locked"]
+    for name, words in seen.items():
+        assert words[0] == "frames" and words[2:4] == ["bytes", "0"], name
+    assert seen["i2c-locked"][-1] == "True", "with failed transfers among them"
+
+
+@pytest.mark.parametrize("name", ["unix", "unix32"])
+@pytest.mark.parametrize("twin", ["slice", "format"])
+def test_what_allocates_is_noticed(name, portable, twin):
+    seen = results(portable(require(name), "ssd1306_alloc.py", twin))
+    assert seen["i2c-locked"] == ["ALLOCATES"]
+    assert int(seen["i2c-free"][3]) > 0
