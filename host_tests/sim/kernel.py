@@ -213,6 +213,8 @@ def schedule(function, argument):
 def _run_hard():
     global _in_irq, _locked, irq_count
     while _hard:
+        if _stop_us is not None and _now >= _stop_us:
+            return  # callbacks longer than their period would starve the main program for ever
         irq = _hard.pop(0)
         irq.pending = False
         irq_count += 1
