@@ -1,0 +1,334 @@
+"""The FIFO mode of the MPU6050 driver: whole packets, in order, none twice, whatever happens to the
+bus between them."""
+
+from array import array
+from itertools import pairwise
+
+import kernel
+import machine
+import pytest
+from chips.mpu6050 import MPU6050Chip
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from mpu6050 import HEALTH_OK, MPU6050
+from world import StillWorld
+
+WORDS = (0, 1, 2, 9, 3, 4, 5)  # places in a row of the words of a packet
+
+
+class Numbered(StillWorld):
+    """A trial at 1 kHz whose every word tells which sample and which word it is."""
+
+    def __init__(self):
+        super().__init__((), (1000, 1), clocked=True, n=30_000)
+        self._numbered = array("h", bytes(22))
+
+    def row(self, k):
+        for place, i in enumerate(WORDS):
+            self._numbered[i] = (k + place * 4681) & 0x7FFF
+        return self._numbered
+
+
+def number(counts):
+    """The sample that counts hold; fails unless all seven words are that sample's own, each in its
+    place."""
+    k = counts[0]
+    assert [counts[i] for i in WORDS] == [(k + place * 4681) & 0x7FFF for place in range(7)]
+    return k
+
+
+def running(batch=8, **options):
+    world = Numbered()
+    chip = MPU6050Chip(world, **options)
+    machine.wire_i2c(0, chip)
+    imu = MPU6050(machine.I2C(0, freq=400_000))
+    imu.configure(sample_rate_hz=1000)
+    world.start(kernel.now())
+    imu.fifo_enable(batch)
+    return chip, imu
+
+
+def drain(imu):
+    """Numbers of the fresh samples that one poll delivers."""
+    numbers = []
+    for _ in range(imu.fifo_poll()):
+        if imu.fifo_next() & 1:
+            numbers.append(number(imu.counts))
+    return numbers
+
+
+def polled(imu, times, us):
+    numbers = []
+    for _ in range(times):
+        kernel.advance(us)
+        numbers += drain(imu)
+    return numbers
+
+
+def consecutive(numbers):
+    return numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+
+
+def test_every_sample_is_delivered_once_and_in_order():
+    chip, imu = running()
+    numbers = polled(imu, 1000, 2000)
+    assert consecutive(numbers) and len(numbers) > 2000
+    assert (imu.fifo_overflows, imu.fifo_lost, imu.errors, imu.fifo_resets) == (0, 0, 0, 1)
+    assert chip.misuse == []
+
+
+@pytest.mark.parametrize("batch", [1, 3, 73])
+def test_a_batch_is_no_larger_than_asked_for(batch):
+    _, imu = running(batch)
+    kernel.advance(30_000)
+    n = imu.fifo_poll()
+    assert n == batch if batch < 30 else n in (30, 31)
+    assert imu.fifo_level in (30 - n, 31 - n)
+
+
+def test_what_is_not_yet_taken_is_kept_and_nothing_is_fetched_on_top():
+    _, imu = running()
+    kernel.advance(10_000)
+    assert imu.fifo_poll() == 8
+    imu.fifo_next()
+    first = number(imu.counts)
+    bus = machine.I2C(0)._bus
+    before = bus.bytes
+    assert imu.fifo_poll() == 7
+    assert bus.bytes == before
+    assert drain(imu) == list(range(first + 1, first + 8))
+    assert imu.fifo_next() == 0 and not imu.counts[10] & 1
+
+
+def test_a_half_written_packet_is_left_for_the_next_poll():
+    chip, imu = running(fifo_byte_us=40)
+    numbers = []
+    partial = 0
+    for i in range(300):
+        kernel.advance(1700 + i % 7 * 100)
+        partial += chip.fifo_count % 14 != 0
+        numbers += drain(imu)
+    assert partial > 20
+    assert consecutive(numbers) and imu.fifo_lost == 0
+
+
+@pytest.mark.parametrize("stall_ms", [60, 74, 80, 147, 500])
+def test_an_overflow_is_counted_dropped_and_left_behind(stall_ms):
+    _, imu = running()
+    numbers = polled(imu, 20, 2000)
+    kernel.advance(stall_ms * 1000)
+    numbers += polled(imu, 100, 2000)
+    assert numbers == sorted(set(numbers))
+    assert numbers[-1] - numbers[0] > 250 and consecutive(numbers[-100:])
+    overflowed = stall_ms >= 74  # 1024 bytes hold 73 packets
+    assert imu.fifo_overflows == overflowed
+    assert (imu.fifo_lost >= 70) is overflowed
+    assert consecutive(numbers) is not overflowed
+
+
+def test_without_the_look_at_the_overflow_flag_packets_would_be_misaligned():
+    _, imu = running()
+
+    def careless(n):
+        imu._read_into(0x74, imu._views[n])
+        imu._at, imu._pending = 0, n
+        return n
+
+    imu._fifo_drain = careless
+    kernel.advance(80_000)
+    with pytest.raises(AssertionError):
+        drain(imu)
+
+
+@pytest.mark.parametrize("transaction", range(2))
+@pytest.mark.parametrize("after", [0, 1, 2])
+def test_a_nack_loses_at_most_what_was_in_the_fifo(transaction, after):
+    chip, imu = running()
+    numbers = polled(imu, 10, 2000)
+    kernel.advance(2000)
+    chip.nack_next(1, after=3 * transaction + after)
+    assert drain(imu) == []
+    assert imu.errors == 1
+    numbers += polled(imu, 20, 2000)
+    assert numbers == sorted(set(numbers)) and consecutive(numbers[-20:])
+    assert consecutive(numbers) is (transaction == 0)  # a failed count costs nothing
+    assert bool(imu.fifo_lost) is (transaction == 1)
+
+
+def test_an_overflow_that_read_has_seen_is_not_forgotten():
+    _, imu = running()
+    kernel.advance(90_000)
+    imu.read()  # clears the flag in the chip
+    numbers = polled(imu, 50, 2000)
+    assert len(numbers) > 50 and consecutive(numbers)
+
+
+@pytest.mark.parametrize("who", [0x68, 0x70])
+def test_fifo_mode_comes_back_after_a_brown_out(who):
+    chip, imu = running(who_am_i=who)
+    chip.world._numbered[9] = 0
+    numbers = []
+
+    def deliver():
+        for _ in range(imu.fifo_poll()):
+            if imu.fifo_next() & 1:
+                numbers.append(imu.counts[0])
+
+    for i in range(200):
+        kernel.advance(1000)
+        if i == 50:
+            chip.brown_out(kernel.now())
+        deliver()
+        imu.health()
+    assert imu.resets == 1
+    assert numbers == sorted(set(numbers)) and consecutive(numbers[-50:])
+    gap = max(b - a for a, b in pairwise(numbers))
+    assert 50 < gap < 150  # power-up, repair, settling
+    assert imu.counts[3] == (imu.counts[0] + 4 * 4681) & 0x7FFF  # settled, at the right scale
+
+
+def test_after_fifo_disable_read_delivers_again():
+    chip, imu = running()
+    polled(imu, 5, 2000)
+    imu.fifo_disable()
+    assert imu.fifo_poll() == 0
+    kernel.advance(1000)
+    assert imu.read() & 1
+    assert (chip.register(0x23), chip.register(0x38), chip.register(0x6A)) == (0, 1, 0)
+
+
+def test_self_test_and_sleep_leave_fifo_mode_whole():
+    _, imu = running()
+    polled(imu, 5, 2000)
+    imu.self_test()
+    assert consecutive(polled(imu, 20, 2000))
+    imu.sleep()
+    kernel.advance(100_000)
+    imu.wake()
+    assert consecutive(polled(imu, 20, 2000))
+
+
+@pytest.mark.parametrize("batch", [0, -1, 74])
+def test_a_batch_that_the_fifo_cannot_hold_is_refused(batch):
+    _, imu = running()
+    with pytest.raises(ValueError, match=f"batch {batch} is not 1 to 73"):
+        imu.fifo_enable(batch)
+
+
+class Hostile:
+    """A bus on which anything may happen: `plan` has, for each transaction in turn, (delay before
+    it, per byte, fault).
+
+    fault: None; ("nack", n) refuses the n-th acknowledge; ("cut", n) fails after n bytes read;
+    ("brown", n) lets the supply dip before byte n of a read.
+    """
+
+    def __init__(self, chip, now, plan):
+        self.chip, self.now, self.plan = chip, now, list(plan)
+
+    def _begin(self):
+        delay, per_byte, fault = self.plan.pop() if self.plan else (500, 25, None)
+        self.now += delay
+        self.per_byte = per_byte
+        kind, n = fault or (None, 0)
+        if kind == "nack":
+            self.chip.nack_next(1, after=n)
+        return kind, n
+
+    def _sent(self, ack):
+        self.now += self.per_byte
+        if not ack:
+            self.chip.i2c_stop(self.now)
+            raise OSError(5)
+
+    def readfrom_mem_into(self, address, register, buffer):
+        kind, n = self._begin()
+        self._sent(self.chip.i2c_start(False, self.now))
+        self._sent(self.chip.i2c_write(register, self.now))
+        self._sent(self.chip.i2c_start(True, self.now))
+        for i in range(len(buffer)):
+            if kind == "cut" and i == n:
+                self.chip.i2c_stop(self.now)
+                raise OSError(110)
+            if kind == "brown" and i == n:
+                self.chip.brown_out(self.now)
+            buffer[i] = self.chip.i2c_read(self.now)
+            self.now += self.per_byte
+        self.chip.i2c_stop(self.now)
+
+    def writeto(self, address, buffer):
+        self._begin()
+        self._sent(self.chip.i2c_start(False, self.now))
+        for byte in buffer:
+            self._sent(self.chip.i2c_write(byte, self.now))
+        self.chip.i2c_stop(self.now)
+
+
+def test_a_burst_cut_off_and_a_restart_that_fails_too_leave_no_half_packet_behind():
+    chip, imu = running()
+    imu._i2c = bus = Hostile(chip, kernel.now() + 5000, [])
+    before = drain(imu)
+    bus.now += 5000
+    bus.plan = [(0, 25, ("nack", 0)), (0, 25, ("cut", 33)), (0, 25, None)]  # taken from the end
+    assert drain(imu) == []
+    assert imu.errors == 2 and 5 <= imu.fifo_lost <= 10
+    numbers = []
+    for _ in range(20):
+        bus.now += 2000
+        numbers += drain(imu)
+    assert before and consecutive(numbers) and numbers[0] > before[-1]
+
+
+delays = st.one_of(st.integers(0, 3000), st.integers(60_000, 90_000), st.integers(0, 300_000))
+faults = st.one_of(
+    st.none(),
+    st.none(),
+    st.tuples(st.just("nack"), st.integers(0, 3)),
+    st.tuples(st.just("cut"), st.integers(0, 112)),
+    st.tuples(st.just("brown"), st.integers(0, 112)),
+)
+plans = st.lists(st.tuples(delays, st.sampled_from([0, 25, 300]), faults), max_size=40)
+
+
+@given(
+    plan=plans,
+    byte_us=st.sampled_from([0, 7, 60]),
+    batch=st.integers(1, 20),
+    health=st.booleans(),
+    restart_us=st.sampled_from([0, 20_000]),
+)
+@example([(75_000, 0, None)] * 12, 0, 8, True, 0)
+@example([(500, 25, ("brown", 30))] * 3, 0, 8, True, 0)
+@settings(max_examples=120, deadline=None)
+def test_no_misaligned_packet_whatever_happens_between_any_two_transactions(
+    plan, byte_us, batch, health, restart_us
+):
+    machine.power_on()
+    chip, imu = running(batch, fifo_byte_us=byte_us)
+    chip.power_up_us = restart_us  # 0: a dip so short that the chip never stops answering
+    imu._i2c = bus = Hostile(chip, kernel.now(), plan)
+    last = -1
+
+    def step():
+        nonlocal last
+        for _ in range(imu.fifo_poll()):
+            if imu.fifo_next() & 1:
+                k = number(imu.counts)
+                assert k > last
+                last = k
+        state = imu.health() if health else HEALTH_OK
+        bus.now += 1000
+        return state
+
+    while bus.plan:
+        step()
+    # and afterwards it always finds back to whole, unbroken delivery
+    chip.nack_next(0)
+    if health:
+        for _ in range(150):
+            step()
+        before = last
+        for _ in range(50):
+            step()
+        assert last > before + 25
+        assert step() == HEALTH_OK
