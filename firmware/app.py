@@ -166,7 +166,12 @@ class App:
         display = self.display if self.config.DISPLAY_SHARES_BUS else None
         fifo = self.config.DRIVE == "fifo"
         self.tick = tick = ticks.Tick(
-            self.imu, self.filter, 0 if fifo else self._period_us, display, self.config.DISPLAY_CHUNK
+            self.imu,
+            self.filter,
+            0 if fifo else self._period_us,
+            display,
+            self.config.DISPLAY_CHUNK,
+            ticks.FOLLOW_TIMER if self.config.DRIVE == "timer" else ticks.FOLLOW_CHIP,
         )
         if display is not None:
             self._flush()  # the bus is the tick's from here on

@@ -2,12 +2,17 @@
 # Needs a driver of lib/ (read, health, counts) and a filter of lib/ (update, quaternion). Every port.
 
 from array import array
-from time import ticks_diff, ticks_us
+from time import ticks_add, ticks_diff, ticks_us
 
 _Q = 0  # published: quaternion Q29, then flags of the last sample and the number of steps
 _FLAGS = 4
 _STEPS = 5
 _WORDS = 6
+
+# The timer's clock is the one that ticks_us shows, give or take make_tick's rounding (100 ppm: 0.1 of a period behind).
+FOLLOW_TIMER = 10
+# The chip's clock on the data-ready line may be off by some percent (2 %: 0.64 of a period behind).
+FOLLOW_CHIP = 5
 
 _FRESH = 1
 _WRAP = 0x3FFFFFFF  # counters stay small ints
@@ -24,17 +29,19 @@ class Tick:
     in `error`), and in the driver's and display's own counters.
 
     period_us  the sample period, to notice ticks that never came; 0 with the FIFO, whose packets say it
+    follow     how readily the expected time follows the ticks' own clock: by late / 2**follow a tick
     display    given only where the tick owns the display's bus
     """
 
-    def __init__(self, imu, filter, period_us, display=None, chunk=32):
+    def __init__(self, imu, filter, period_us, display=None, chunk=32, follow=FOLLOW_TIMER):
         self._imu = imu
         self._filter = filter
         self._counts = imu.counts
         self._display = display
         self._chunk = chunk
         self._period = period_us
-        self._last = ticks_us()
+        self._follow = follow
+        self._due = ticks_us()
         self._started = False
         self._made_up = 0
         self._inside = False
@@ -76,8 +83,8 @@ class Tick:
             if n == 0:
                 imu.health()
             while n > 0:
-                if imu.fifo_next():
-                    self._step()
+                imu.fifo_next()  # a packet that is withheld after a reset is a step all the same: it coasts
+                self._step()
                 n -= 1
             if self._display is not None:
                 self._display.flush_step(self._chunk)
@@ -105,32 +112,39 @@ class Tick:
         self.error = error
 
     def _on_time(self):
-        """Coast through ticks that never came. False: this tick is one that was made up for and came late."""
+        """Coast through ticks that never came. False: this tick is one that was made up for and came late.
+
+        Ticks are held against where the next one is due, not against the last one: a tick that always takes a
+        little longer than its period loses some, and every gap alone would look fit.
+        """
         period = self._period
         if period == 0:
             return True
-        now = ticks_us()
-        gap = ticks_diff(now, self._last)
+        late = ticks_diff(ticks_us(), self._due)
         if not self._started:
             self._started = True
-        elif gap < period >> 1:
-            if self._made_up:
-                self._made_up -= 1
-                return False
-        elif gap > period + (period >> 1):
-            lost = (gap + (period >> 1)) // period - 1
-            self.missed = (self.missed + lost) & _WRAP
-            if lost > _MOST_COASTS:
-                lost = _MOST_COASTS
-            self._made_up = lost
-            self._counts[10] &= ~_FRESH
-            while lost > 0:
-                self._filter.update(self._counts)
-                lost -= 1
-        else:
+            self._due = ticks_add(self._due, late + period)
+            return True
+        if late >= period:
+            self._coast(late // period)
+        elif late < -(period >> 1) and self._made_up:
+            self._made_up -= 1
+            return False
+        elif late < period >> 1:
             self._made_up = 0
-        self._last = now
+        self._due = ticks_add(self._due, period + (late >> self._follow))
         return True
+
+    def _coast(self, lost):
+        self.missed = (self.missed + lost) & _WRAP
+        self._due = ticks_add(self._due, lost * self._period)
+        if lost > _MOST_COASTS:
+            lost = _MOST_COASTS
+        self._made_up = lost
+        self._counts[10] &= ~_FRESH
+        while lost > 0:
+            self._filter.update(self._counts)
+            lost -= 1
 
     def _step(self):
         self._filter.update(self._counts)

@@ -1,5 +1,5 @@
 # Boots the firmware (boot.py, main.py) on the simulated board: chips on its buses, a moving world under them.
-# Run by `upright demo` and the tests on every runtime. Arguments: one JSON object, see CONFIG.
+# Run by `upright demo` and the tests on every runtime. Argument: a JSON file, see CONFIG.
 # Lines on standard output that begin with a tab are for the host; the rest is the board's console.
 
 import json
@@ -23,6 +23,7 @@ CONFIG = {
     "who_am_i": 0x68,
     "display": True,
     "irq_cost_us": 0,  # what the tick's code takes, beside its bus time
+    "twin": None,  # "main_writes_shared_bus": what the firmware must not do, to show that it would be noticed
     "faults": [],  # [at_us, "imu" or "display" or "bus", method, arguments...]: what goes wrong, and when
 }
 
@@ -97,7 +98,8 @@ class Recorder:
 
 def main():
     config = dict(CONFIG)
-    config.update(json.loads(sys.argv[1]))
+    with open(sys.argv[1]) as file:
+        config.update(json.load(file))
     machine.power_on()
     world = World(config["world"]) if config["world"] else StillWorld()
     world.start(0)
@@ -123,6 +125,8 @@ def main():
 
     for name, value in config["board"].items():
         setattr(board, name, tuple(value) if isinstance(value, list) else value)
+    if config["twin"] == "main_writes_shared_bus":
+        spoil_display_ownership()
     program = {"__name__": "__main__"}
     if recorder:
         recorder.main = program
@@ -134,6 +138,20 @@ def main():
     except kernel.Reset as reset:
         print("reset, cause", reset.args[0])
     finish(program.get("application"), recorder, buses, oled)
+
+
+def spoil_display_ownership():
+    """The main program flushes a display that is on the sensor's bus, behind the tick's back."""
+    import app
+
+    poll = app.App.poll
+
+    def poll_and_flush(self):
+        poll(self)
+        if self.display.busy:
+            self.display.flush_step(self.config.DISPLAY_CHUNK)
+
+    app.App.poll = poll_and_flush
 
 
 def execute(name, namespace):

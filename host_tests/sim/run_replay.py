@@ -1,5 +1,5 @@
 # Replays an `.imu` file through a filter and writes the attitude after every sample: 4 int32 (Q29) a row.
-# Run by `upright replay` and the tests on every runtime. Arguments: one JSON object, see CONFIG.
+# Run by `upright replay` and the tests on every runtime. Argument: a JSON file, see CONFIG.
 # Lines on standard output that begin with a tab are for the host: progress and the result.
 
 import json
@@ -76,7 +76,8 @@ def through_chip(config, world, rows):
     kernel.advance(2000)
     imu.read()  # until it is started the world stands still at row 0
     filter.seed(imu.counts)
-    tick = ticks.Tick(imu, filter, (2000000 * den + num) // (2 * num))
+    period_us = (2000000 * den + num) // (2 * num)
+    tick = ticks.Tick(imu, filter, period_us, follow=ticks.FOLLOW_CHIP)
     recorder = Recorder(config["out"], filter, rows)
 
     def after_tick():
@@ -136,7 +137,8 @@ def straight(config, world, rows):
 
 def main():
     config = dict(CONFIG)
-    config.update(json.loads(sys.argv[1]))
+    with open(sys.argv[1]) as file:
+        config.update(json.load(file))
     world = World(config["world"])
     rows = world.n if config["rows"] is None else min(config["rows"], world.n)
     result = (straight if config["direct"] else through_chip)(config, world, rows)

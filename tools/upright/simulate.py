@@ -33,33 +33,37 @@ def run(runtime: str, script: Path, config: dict, on_event=None) -> dict:
     that the script meant for the host ("frame", "time", "at"), with the other words in fields.
     Raises SimulationError, and runtimes.Unavailable.
     """
-    argv, environment = runtimes.command(runtime, script, [json.dumps(config)])
     result, said = None, []
-    with (
-        tempfile.TemporaryFile("w+") as errors,
-        subprocess.Popen(
-            argv, env=environment, stdout=subprocess.PIPE, stderr=errors, text=True, bufsize=1
-        ) as process,
-    ):
-        try:
-            for line in process.stdout:
-                line = line.rstrip("\n")
-                if not line.startswith("\t"):
-                    said.append(line)
-                    if on_event:
-                        on_event("console", [line])
-                    continue
-                kind, _, rest = line[1:].partition(" ")
-                if kind == "result":
-                    result = json.loads(rest)
-                elif on_event:
-                    on_event(kind, rest.split(" "))
-        except BaseException:
-            process.kill()
-            raise
-        code = process.wait()
-        errors.seek(0)
-        tail = errors.read().strip().splitlines()[-8:]
+    with tempfile.TemporaryDirectory() as folder:
+        # In a file, since an argument of more than 255 bytes is too long for MicroPython.
+        told = Path(folder) / "config.json"
+        told.write_text(json.dumps(config))
+        argv, environment = runtimes.command(runtime, script, [told])
+        with (
+            open(Path(folder) / "errors", "w+") as errors,
+            subprocess.Popen(
+                argv, env=environment, stdout=subprocess.PIPE, stderr=errors, text=True, bufsize=1
+            ) as process,
+        ):
+            try:
+                for line in process.stdout:
+                    line = line.rstrip("\n")
+                    if line.startswith("\tresult "):
+                        result = json.loads(line[8:])
+                    elif line.startswith("\t"):
+                        kind, *fields = line[1:].split(" ")
+                        if on_event:
+                            on_event(kind, fields)
+                    else:
+                        said.append(line)
+                        if on_event:
+                            on_event("console", [line])
+            except BaseException:
+                process.kill()
+                raise
+            code = process.wait()
+            errors.seek(0)
+            tail = errors.read().strip().splitlines()[-8:]
     if code or result is None:
         lines = "\n".join(said[-4:] + tail)
         raise SimulationError(f"{script.name} on {runtime} ended with {code}:\n{lines}")

@@ -1,0 +1,283 @@
+"""The whole firmware on the simulated board: it boots, it is right, and it survives what goes wrong.
+
+Every run is a process of its own on a runtime; faults are put in at their simulated time.
+"""
+
+import numpy as np
+import pytest
+
+from upright import demo, oled, scoring, simulate
+
+SECOND = 1000000
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    """The demo's motion: 12 s of it, at 1 kHz, with a typical sensor's errors."""
+    import motions
+
+    path = tmp_path_factory.mktemp("world") / "demo.imu"
+    motion = motions.render("demo", rate=(1000, 1), seconds=12)
+    motion.write(path)
+    return path, motion
+
+
+@pytest.fixture
+def boot(world, tmp_path):
+    """boot(**config) -> (result, console lines, last picture as rows, world rows, attitudes Q29)."""
+
+    def run(runtime=None, **config):
+        lines, frames = [], []
+
+        def event(kind, fields):
+            if kind == "console":
+                lines.append(fields[0])
+            elif kind == "frame":
+                frames.append(bytes.fromhex(fields[1]))
+
+        out = tmp_path / "steps"
+        config = {"world": str(world[0]), "seconds": 4, "frame_ms": 100, "out": str(out)} | config
+        result = simulate.run(runtime or simulate.best_runtime(), simulate.FIRMWARE, config, event)
+        rows, q29 = simulate.read_steps(out)
+        picture = oled.rows_of_frame(frames[-1]) if frames else None
+        return result, lines, picture, rows, q29
+
+    return run
+
+
+def healthy(result):
+    """Nothing went wrong that should not have."""
+    assert result["started"]
+    assert result["error"] is None
+    assert (result["crashes"], result["uncaught"], result["cuts"]) == (0, 0, 0)
+    assert result["display_misuse"] == []
+
+
+def error_deg(world, rows, q29):
+    """Inclination and aligned total RMSE against the truth."""
+    motion = world[1]
+    score = scoring.score(rows / 1000, q29 / scoring.ONE, motion.t, motion.q_true)
+    return score.inclination, score.aligned_total
+
+
+def dark(picture):
+    return not any(any(row) for row in picture)
+
+
+@pytest.fixture(scope="module")
+def histories():
+    return {}
+
+
+def test_it_boots_and_is_right_on_every_runtime_with_the_same_bits(
+    runtime, boot, world, histories
+):
+    result, lines, picture, rows, q29 = boot(runtime, seconds=6)
+    healthy(result)
+    assert result["missed"] == result["errors"] == 0
+    assert result["bias_known"]
+    assert result["ticker"] == "machine.Timer, hard"
+    assert abs(result["steps"] - 200 * (6 - rows[0] / 1000)) <= 2
+    inclination, total = error_deg(world, rows, q29)
+    assert inclination < 0.6
+    assert total < 1.0
+    assert any("MPU6050" in line for line in lines)
+    assert not dark(picture)
+    histories[runtime] = (rows.tobytes(), q29.tobytes(), [bytes(row) for row in picture])
+    assert histories[runtime] == next(iter(histories.values()))
+
+
+@pytest.mark.parametrize("own_bus", [False, True], ids=["shared", "separate"])
+def test_no_transfer_cuts_into_another_in_ten_minutes(boot, own_bus):
+    """And the failing twin below shows that it would be noticed."""
+    result, *_ = boot(
+        seconds=600, world=None, frame_ms=0, board={"DISPLAY_SHARES_BUS": not own_bus, "RATE": 100}
+    )
+    healthy(result)
+    assert result["steps"] > 59000
+    assert result["missed"] == 0
+    assert result["display_errors"] == 0
+    assert result["bus_bytes"][1 if own_bus else 0] > 50000  # the display was written all the time
+
+
+def test_a_display_written_by_the_main_program_on_the_sensors_bus_cuts(boot):
+    result, *_ = boot(seconds=10, twin="main_writes_shared_bus")
+    assert result["cuts"] > 0
+
+
+def test_1_khz_with_a_display_on_its_own_bus(boot, world):
+    result, _, _, rows, q29 = boot(
+        seconds=5, board={"RATE": 1000, "DISPLAY_SHARES_BUS": False}, irq_cost_us=200
+    )
+    healthy(result)
+    assert result["missed"] == 0
+    assert result["steps"] > 3000
+    assert error_deg(world, rows, q29)[0] < 0.6
+
+
+def test_a_tick_that_takes_longer_than_its_period_is_noticed(boot):
+    result, *_ = boot(seconds=4, board={"RATE": 1000, "DISPLAY_SHARES_BUS": False}, irq_cost_us=900)
+    assert result["missed"] > 500  # every other tick
+    assert result["crashes"] == 0
+
+
+@pytest.mark.parametrize(
+    "drive",
+    [
+        {"DRIVE": "data_ready", "SENSOR_RATE_HZ": 200},
+        {"DRIVE": "fifo", "SENSOR_RATE_HZ": 200, "FIFO_HZ": 50},
+    ],
+    ids=["data_ready", "fifo"],
+)
+def test_the_other_drives_are_as_right(boot, world, drive):
+    result, _, _, rows, q29 = boot(seconds=10, board=drive)
+    healthy(result)
+    assert result["missed"] == 0
+    assert result["fifo_overflows"] == 0
+    if drive["DRIVE"] == "data_ready":
+        inclination, total = error_deg(world, rows, q29)
+        assert inclination < 0.6
+        assert total < 1.0
+    else:
+        # several packets a tick: the last one is the newest sample; only the end is compared
+        assert abs(result["steps"] / 200 - (10 - rows[0] / 1000)) < 0.3
+        q = q29[-1] / scoring.ONE
+        true = world[1].q_true[rows[-1]]
+        assert abs(np.degrees(2 * np.arccos(min(1, abs(q @ true))))) < 3
+
+
+def test_without_a_sensor_it_says_so_and_waits_for_one(boot):
+    result, lines, picture, *_ = boot(imu=False, seconds=3)
+    assert not result["started"]
+    assert any("0x68" in line for line in lines)
+    assert sum("sensor:" in line for line in lines) >= 2  # it looks again
+    assert not dark(picture)
+
+
+def test_a_sensor_that_appears_late_is_used(boot):
+    result, lines, *_ = boot(
+        seconds=6,
+        world=None,
+        faults=[[0, "imu", "vanish"], [2 * SECOND, "imu", "come_back"]],
+    )
+    healthy(result)
+    assert result["steps"] > 200
+    assert any("sensor:" in line and "0x68" in line for line in lines)
+
+
+def test_a_wrong_chip_is_named_with_what_it_answered(boot):
+    result, lines, *_ = boot(who_am_i=0x33, seconds=2)
+    assert not result["started"]
+    assert any("0x33" in line for line in lines)
+
+
+@pytest.mark.parametrize("identity", [0x70, 0x71, 0x98])
+def test_the_clones_work(boot, world, identity):
+    result, lines, _, rows, q29 = boot(who_am_i=identity, seconds=6)
+    healthy(result)
+    assert error_deg(world, rows, q29)[0] < 0.6
+
+
+def test_it_goes_on_without_a_display_and_with_one_that_appears(boot):
+    result, lines, *_ = boot(display=False, seconds=4)
+    healthy(result)
+    assert any("display:" in line and "0x3" in line for line in lines)
+    result, lines, picture, *_ = boot(
+        seconds=6, faults=[[0, "display", "vanish"], [3 * SECOND, "display", "come_back"]]
+    )
+    healthy(result)
+    assert result["missed"] == 0
+    assert not dark(picture)
+
+
+def test_a_display_that_loses_its_power_for_a_moment_is_lit_again(boot):
+    result, _, picture, *_ = boot(
+        seconds=8, faults=[[4 * SECOND, "display", "vanish"], [5 * SECOND, "display", "come_back"]]
+    )
+    healthy(result)
+    assert result["display_errors"] > 0
+    assert not dark(picture)
+
+
+def test_a_sensor_that_stops_answering_is_counted_coasted_and_back_again(boot, world):
+    result, _, _, rows, q29 = boot(
+        seconds=8,
+        faults=[[3 * SECOND, "imu", "vanish"], [int(3.1 * SECOND), "imu", "come_back"]],
+    )
+    healthy(result)
+    assert 15 <= result["errors"] <= 60  # 0.1 s at 200 Hz, a read and a look at the registers each
+    assert result["missed"] == 0
+    assert result["fresh"] < result["steps"]
+
+
+def test_nacks_in_the_middle_of_bursts_are_survived(boot, world):
+    faults = [[2 * SECOND + 37000 * i, "imu", "nack_next", 1, i % 3] for i in range(60)]
+    result, _, _, rows, q29 = boot(seconds=6, faults=faults)
+    healthy(result)
+    assert result["errors"] >= 50
+    assert error_deg(world, rows, q29)[0] < 0.7
+
+
+@pytest.mark.parametrize("drive", ["timer", "data_ready", "fifo"])
+def test_a_chip_that_resets_itself_is_put_right_in_flight(boot, drive):
+    """Brown-out while it runs: asleep and unconfigured, then rewritten register by register by the tick."""
+    result, *_ = boot(
+        seconds=6,
+        board={"DRIVE": drive, "SENSOR_RATE_HZ": 200},
+        faults=[[3 * SECOND, "imu", "brown_out"]],
+    )
+    healthy(result)
+    assert result["resets"] == 1
+    expected = result["steps"] if drive == "timer" else 200 * (result["ended_us"] / SECOND - 1.4)
+    assert result["fresh"] > expected - 100  # at most half a second without
+
+
+def test_a_stuck_bus_costs_time_not_the_program(boot):
+    result, *_ = boot(
+        seconds=6, faults=[[3 * SECOND, "bus", "stuck", True], [4 * SECOND, "bus", "stuck", False]]
+    )
+    healthy(result)
+    assert result["errors"] > 5
+    assert result["missed"] > 50
+    assert result["fresh"] > 500
+
+
+def test_a_board_that_never_rests_goes_on_flagged(boot, tmp_path):
+    import motions
+
+    path = tmp_path / "hand.imu"
+    motions.render("spin", rate=(1000, 1), seconds=8).write(path)
+    result, lines, picture, *_ = boot(world=str(path), seconds=8)
+    healthy(result)
+    assert not result["bias_known"]
+    assert any("never at rest" in line for line in lines)
+
+
+def test_a_setting_with_a_slip_of_the_pen_is_refused(boot):
+    with pytest.raises(simulate.SimulationError, match="RATEE"):
+        boot(board={"RATEE": 100})
+
+
+@pytest.mark.parametrize(
+    "settings, said",
+    [
+        ({"RATE": 700}, "cannot tick at"),
+        ({"DRIVE": "telepathy"}, "DRIVE"),
+        ({"FILTER": "magic"}, "unknown filter"),
+        ({"ACCEL_RANGE_G": 3}, "accel_range_g"),
+        ({"GAINS": {"kp": 1000.0}}, "kp"),
+    ],
+)
+def test_a_setting_that_cannot_be_had_stops_the_start_with_a_reason(boot, settings, said):
+    with pytest.raises(simulate.SimulationError, match=said):
+        boot(board=settings)
+
+
+def test_the_demo_is_as_good_as_it_says(world):
+    source = demo.motion_source("demo", 10)
+    outcome = demo.run(source, simulate.best_runtime())
+    assert outcome.score.inclination < 0.6
+    assert outcome.score.coverage > 0.8
+    text = "\n".join(demo.summary(outcome))
+    assert "RMSE" in text
+    assert "missed 0" in text

@@ -1,0 +1,261 @@
+"""The tick: one step a sample whatever the timer does, faults counted and survived, a snapshot that is never torn."""
+
+from array import array
+
+import kernel
+import pytest
+from tick import FOLLOW_CHIP, Tick
+
+PERIOD = 5000
+
+
+class Imu:
+    """Delivers what the test says; counts how it was used."""
+
+    def __init__(self):
+        self.counts = array("h", [0] * 11)
+        self.flags = 1
+        self.reads = 0
+        self.healths = 0
+        self.packets = []
+        self.fail = None
+
+    def read(self):
+        self.reads += 1
+        if self.fail:
+            raise self.fail
+        self.counts[10] = self.flags
+        return self.flags
+
+    def health(self):
+        self.healths += 1
+
+    def fifo_poll(self):
+        return len(self.packets)
+
+    def fifo_next(self):
+        self.counts[0] = self.packets.pop(0)
+        self.counts[10] = 1
+        return 1
+
+
+class Filter:
+    """Remembers the flags and the first word of every sample; its quaternion is the number of steps."""
+
+    def __init__(self):
+        self.flags = []
+        self.words = []
+
+    def update(self, counts):
+        self.flags.append(counts[10])
+        self.words.append(counts[0])
+
+    def quaternion(self, out):
+        for i in range(4):
+            out[i] = len(self.flags)
+
+
+class Display:
+    def __init__(self):
+        self.asked = []
+
+    def flush_step(self, most):
+        self.asked.append(most)
+        return 0
+
+
+@pytest.fixture
+def imu():
+    return Imu()
+
+
+@pytest.fixture
+def filter():
+    return Filter()
+
+
+@pytest.fixture
+def tick(imu, filter):
+    return Tick(imu, filter, PERIOD)
+
+
+def ticks_at(tick, times):
+    """Call the tick at these times (us)."""
+    for at in times:
+        kernel.advance_to(at)
+        tick.on_sample(None)
+
+
+def test_every_tick_is_one_step(tick, filter, imu):
+    ticks_at(tick, range(PERIOD, 11 * PERIOD, PERIOD))
+    assert filter.flags == [1] * 10
+    assert (tick.steps, tick.fresh, tick.missed) == (10, 10, 0)
+
+
+def test_jitter_within_half_a_period_is_no_missed_tick(tick, filter):
+    ticks_at(tick, [5000, 11000, 14000, 20000, 27400, 30100])
+    assert (tick.steps, tick.missed) == (6, 0)
+
+
+def test_missed_ticks_are_counted_and_coasted_through(tick, filter):
+    ticks_at(tick, [5000, 10000, 25000, 30000])
+    # 15000 and 20000 never came: two steps without a fresh sample, then the sample itself
+    assert filter.flags == [1, 1, 0, 0, 1, 1]
+    assert tick.missed == 2
+
+
+def test_ticks_that_were_made_up_for_and_come_late_are_not_stepped_twice(tick, filter, imu):
+    # A callback held up to 25000; the port then runs the late ones one after the other (rp2 does).
+    ticks_at(tick, [5000, 10000, 25000, 25100, 25200, 30000, 35000])
+    assert len(filter.flags) == 7  # 5000..35000: seven periods
+    assert filter.flags == [1, 1, 0, 0, 1, 1, 1]
+    assert imu.reads == 5
+
+
+def test_an_early_tick_that_nothing_was_made_up_for_is_a_step(tick, filter):
+    ticks_at(tick, [5000, 10000, 12000])
+    assert filter.flags == [1, 1, 1]
+
+
+def test_a_tick_always_a_little_too_long_is_noticed(tick, filter):
+    """Every gap alone is below one and a half periods; over 130 ms six of 27 ticks are lost all the same."""
+    ticks_at(tick, range(5000, 136001, 6500))
+    assert tick.missed in (5, 6)  # the last one shows with the next tick
+    assert len(filter.flags) == tick.steps + 6
+
+
+def test_a_chip_clock_that_is_off_by_two_percent_is_no_missed_tick(imu, filter):
+    for period in (4900, 5100):
+        tick = Tick(imu, filter, PERIOD, follow=FOLLOW_CHIP)
+        start = kernel.now()
+        ticks_at(tick, range(start, start + 1000 * period, period))
+        assert (tick.missed, tick.steps) == (0, 1000)
+
+
+def test_a_timer_rounded_to_microseconds_is_no_missed_tick(imu, filter):
+    tick = Tick(imu, filter, 3333)
+    ticks_at(tick, [10000 * k // 3 for k in range(1, 3000)])
+    assert (tick.missed, tick.steps) == (0, 2999)
+
+
+def test_the_steps_made_up_for_at_once_are_bounded_and_all_are_counted(tick, filter):
+    ticks_at(tick, [5000, 5000 + 1000 * PERIOD])
+    assert tick.missed == 999
+    assert len(filter.flags) == 1 + 16 + 1
+
+
+def test_a_stale_sample_is_a_coasting_step_and_health_is_looked_at(tick, filter, imu):
+    imu.flags = 0
+    ticks_at(tick, [5000, 10000, 15000])
+    assert filter.flags == [0, 0, 0]
+    assert (tick.steps, tick.fresh, imu.healths) == (3, 0, 3)
+
+
+def test_health_is_looked_at_now_and_then_while_samples_come(tick, imu):
+    ticks_at(tick, range(PERIOD, 25 * PERIOD, PERIOD))
+    assert imu.healths == 3
+
+
+def test_an_exception_is_counted_and_the_next_tick_works(tick, filter, imu):
+    imu.fail = RuntimeError("broken driver")
+    ticks_at(tick, [5000, 10000])
+    imu.fail = None
+    ticks_at(tick, [15000])
+    assert tick.crashes == 2
+    assert str(tick.error) == "broken driver"
+    assert tick.steps == 1
+
+
+def test_a_tick_inside_a_tick_does_nothing(tick, filter, imu):
+    """A data-ready line at a higher priority than the guard's timer, or the other way round."""
+    read = imu.read
+    imu.read = lambda: (tick.on_sample(None), tick.on_guard(None), read())[-1]
+    ticks_at(tick, [5000])
+    assert (tick.steps, imu.reads) == (1, 1)
+
+
+def test_the_display_gets_one_bounded_piece_a_tick(imu, filter):
+    display = Display()
+    tick = Tick(imu, filter, PERIOD, display, chunk=24)
+    ticks_at(tick, [5000, 10000])
+    assert display.asked == [24, 24]
+
+
+def test_with_the_fifo_each_packet_is_a_step_however_late(imu, filter):
+    tick = Tick(imu, filter, 0)
+    imu.packets = [10, 11, 12]
+    kernel.advance(90000)
+    tick.on_fifo(None)
+    assert filter.words == [10, 11, 12]
+    assert (tick.steps, tick.missed) == (3, 0)
+
+
+def test_an_empty_fifo_is_a_reason_to_look_at_the_chip(imu, filter):
+    tick = Tick(imu, filter, 0)
+    tick.on_fifo(None)
+    assert (tick.steps, imu.healths) == (0, 1)
+
+
+def test_the_guard_looks_at_a_chip_that_has_fallen_silent(tick, imu):
+    ticks_at(tick, [5000])
+    before = imu.healths
+    tick.on_guard(None)  # there was a step since the last one
+    assert imu.healths == before
+    tick.on_guard(None)
+    assert imu.healths == before + 1
+
+
+class Interrupted(array):
+    """The published state, with a tick between any two words that are read from it."""
+
+    def __getitem__(self, i):
+        value = array.__getitem__(self, i)
+        if self.left and not self.busy:
+            self.busy = True
+            self.left -= 1
+            self.step()
+            self.busy = False
+        return value
+
+
+def interrupted(tick, times):
+    """Let the tick run at the next `times` reads of its published state."""
+    state = Interrupted("i", tick._state)
+    state.left, state.busy = times, False
+
+    def step():
+        kernel.advance(PERIOD)
+        tick.on_sample(None)
+
+    state.step = step
+    tick._state = state
+
+
+@pytest.mark.parametrize("times", range(14))
+def test_a_snapshot_is_never_torn(tick, times):
+    ticks_at(tick, [5000])
+    interrupted(tick, times)
+    out = array("i", [0] * 6)
+    assert tick.snapshot(out)
+    assert len(set(out[:4])) == 1
+    assert out[5] == out[0]  # the steps of the same step
+
+
+def test_a_plain_copy_of_the_state_would_be_torn(tick):
+    ticks_at(tick, [5000])
+    interrupted(tick, 3)
+    copy = [tick._state[i] for i in range(6)]
+    assert len(set(copy[:4])) > 1
+
+
+def test_a_snapshot_that_cannot_be_had_says_so(tick):
+    ticks_at(tick, [5000])
+    interrupted(tick, 10**6)
+    assert not tick.snapshot(array("i", [0] * 6))
+
+
+def test_a_snapshot_taken_while_the_state_is_written_is_refused(tick):
+    """Another core would see the sequence odd."""
+    ticks_at(tick, [5000])
+    tick._sequence |= 1
+    assert not tick.snapshot(array("i", [0] * 6))
