@@ -146,7 +146,7 @@ def end_transfer():
     global _busy
     _busy -= 1
     if not _busy and not _in_irq:
-        _run_soft()
+        _main_turn()
 
 
 def advance(us):
@@ -176,11 +176,16 @@ def advance_to(target):
     if _hard and not _masked:
         _run_hard()
     if not _busy:
-        _run_soft()
-        if reset_request is not None:
-            raise Reset(reset_request)
-        if _stop_us is not None and _now >= _stop_us:
-            raise PowerOff("simulation ended")
+        _main_turn()
+
+
+def _main_turn():
+    """What the main program meets between two of its steps: soft callbacks, a reset, the end of the simulation."""
+    _run_soft()
+    if reset_request is not None:
+        raise Reset(reset_request)
+    if _stop_us is not None and _now >= _stop_us:
+        raise PowerOff("simulation ended")
 
 
 def sleep_us(us):

@@ -73,7 +73,7 @@ class Recorder:
     """The attitude after every step, with the row of the world that it belongs to."""
 
     def __init__(self, path, world, chip):
-        self._file = open(path, "wb")  # noqa: SIM115  (open until the end of the run)
+        self._file = open(path, "wb")
         self._world = world
         self._chip = chip
         self._row = array("i", [0] * 5)

@@ -6,14 +6,13 @@ import json
 import sys
 from array import array
 
+import filters
 import kernel
 import machine
+import tick as ticks
 from chips.mpu6050 import MPU6050Chip
 from mpu6050 import MPU6050
 from world import World
-
-import filters
-import tick as ticks
 
 CONFIG = {
     "world": "",  # the .imu file
@@ -32,7 +31,7 @@ class Recorder:
     """Writes the attitude of every step, in blocks."""
 
     def __init__(self, path, filter, rows):
-        self._file = open(path, "wb")  # noqa: SIM115  (closed by close)
+        self._file = open(path, "wb")
         self._filter = filter
         self._q = array("i", [0] * 4)
         self.rows = 0

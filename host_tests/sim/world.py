@@ -80,7 +80,7 @@ class World(_Clock):
     """
 
     def __init__(self, path):
-        self._file = open(path, "rb")  # noqa: SIM115  (read until close)
+        self._file = open(path, "rb")
         try:
             header, self._base = _read_header(self._file, path)
         except ValueError:
