@@ -72,7 +72,9 @@ class App:
         imu = self.imu
         rate = self.config.RATE
         if self.config.DRIVE != "timer" and not self.config.EXTERNAL_CLOCK:
-            rate = imu.sample_rate  # every packet or data-ready edge is one step, so the chip's rate is the rate
+            rate = (
+                imu.sample_rate
+            )  # every packet or data-ready edge is one step, so the chip's rate is the rate
         self.filter = filters.make(self.config.FILTER, rate, imu, self.config.GAINS)
         if self.config.MEASURE_BIAS:
             self.say("Keep still", "measuring the", "gyro's bias")
@@ -81,7 +83,10 @@ class App:
                 print("bias: never at rest, going on without (marked B? on the display)")
         self._seed()
         self._start_tick(rate)
-        print("tick: %s, every %d us, %s drive" % (self.ticker.what, self._period_us, self.config.DRIVE))
+        print(
+            "tick: %s, every %d us, %s drive"
+            % (self.ticker.what, self._period_us, self.config.DRIVE)
+        )
 
     def _open_display(self):
         try:
@@ -89,7 +94,9 @@ class App:
             if self.display is not None:
                 self._pages = pages.Pages(self.display)
                 self.display.begin()
-        except OSError as why:  # the attitude is worth having without a display; it may still appear
+        except (
+            OSError
+        ) as why:  # the attitude is worth having without a display; it may still appear
             print("display:", why)
 
     def _open_sensor(self):
@@ -185,7 +192,9 @@ class App:
             self.ticker = _DataReady(board.data_ready_pin(), tick.on_sample, self._period_us)
             self.guard = board.make_tick(_GUARD_HZ, tick.on_guard)
         else:
-            raise ValueError('DRIVE is "timer", "data_ready" or "fifo", not %r' % (self.config.DRIVE,))
+            raise ValueError(
+                'DRIVE is "timer", "data_ready" or "fifo", not %r' % (self.config.DRIVE,)
+            )
 
     # ------------------------------------------------------------------------------------ main loop
 

@@ -2,5 +2,7 @@
 
 import micropython
 
-if hasattr(micropython, "alloc_emergency_exception_buf"):  # built in on boards, left out of some unix ports
+if hasattr(
+    micropython, "alloc_emergency_exception_buf"
+):  # built in on boards, left out of some unix ports
     micropython.alloc_emergency_exception_buf(100)

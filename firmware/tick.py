@@ -17,7 +17,9 @@ FOLLOW_CHIP = 5
 _FRESH = 1
 _WRAP = 0x3FFFFFFF  # counters stay small ints
 _HEALTH_EVERY = 8  # ticks between two looks at a configuration register while samples come in
-_MOST_COASTS = 16  # steps made up for at once: bounds the tick, and past it the last rate says nothing
+_MOST_COASTS = (
+    16  # steps made up for at once: bounds the tick, and past it the last rate says nothing
+)
 
 
 class Tick:
@@ -69,7 +71,9 @@ class Tick:
                 self._step()
                 if self._display is not None:
                     self._display.flush_step(self._chunk)
-        except Exception as error:  # it must not stop the timer: counted, and shown by the main program
+        except (
+            Exception
+        ) as error:  # it must not stop the timer: counted, and shown by the main program
             self._crashed(error)
         self._inside = False
 

@@ -9,7 +9,6 @@ for folder in ("boards/sim", "firmware", "lib", "host_tests", "host_tests/sim", 
 
 import micropython  # noqa: E402, F401  (the shim: it prepares `time` before anything of lib/ is imported)
 import pytest  # noqa: E402
-
 from upright import runtimes  # noqa: E402
 
 PORTABLE = Path(__file__).parent / "portable"

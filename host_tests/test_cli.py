@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from PIL import Image
 from typer.testing import CliRunner
-
 from upright import cli, scoring, simulate
 
 
@@ -116,7 +115,7 @@ def test_replay_writes_the_same_bytes_on_every_runtime_and_scores(
     out, ours = tmp_path / "out.csv", tmp_path / "ours.csv"
     done = upright("replay", trial, "--runtime", runtime, "--out", out, "--seconds", 3)
     assert done.exit_code == 0, done.output
-    t, q = scoring.read_csv(out)
+    t, _ = scoring.read_csv(out)
     assert len(t) == 600
     assert t[-1] == pytest.approx(599 / 200)
     assert "inclination" in done.output

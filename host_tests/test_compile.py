@@ -3,10 +3,11 @@
 import subprocess
 
 import pytest
-
 from upright import paths, runtimes
 
-FILES = sorted([*paths.LIB.glob("*.py"), *paths.FIRMWARE.glob("*.py"), *paths.BOARDS.glob("*/board.py")])
+FILES = sorted(
+    [*paths.LIB.glob("*.py"), *paths.FIRMWARE.glob("*.py"), *paths.BOARDS.glob("*/board.py")]
+)
 TARGETS = [
     (version, march)
     for version in runtimes.MPY_CROSS_VERSIONS

@@ -5,7 +5,6 @@ Every run is a process of its own on a runtime; faults are put in at their simul
 
 import numpy as np
 import pytest
-
 from upright import demo, oled, scoring, simulate
 
 SECOND = 1000000
@@ -69,9 +68,7 @@ def histories():
     return {}
 
 
-def test_it_boots_and_is_right_on_every_runtime_with_the_same_bits(
-    runtime, boot, world, histories
-):
+def test_it_boots_and_is_right_on_every_runtime_with_the_same_bits(runtime, boot, world, histories):
     result, lines, picture, rows, q29 = boot(runtime, seconds=6)
     healthy(result)
     assert result["missed"] == result["errors"] == 0
@@ -173,7 +170,7 @@ def test_a_wrong_chip_is_named_with_what_it_answered(boot):
 
 @pytest.mark.parametrize("identity", [0x70, 0x71, 0x98])
 def test_the_clones_work(boot, world, identity):
-    result, lines, _, rows, q29 = boot(who_am_i=identity, seconds=6)
+    result, _, _, rows, q29 = boot(who_am_i=identity, seconds=6)
     healthy(result)
     assert error_deg(world, rows, q29)[0] < 0.6
 
@@ -200,7 +197,7 @@ def test_a_display_that_loses_its_power_for_a_moment_is_lit_again(boot):
 
 
 def test_a_sensor_that_stops_answering_is_counted_coasted_and_back_again(boot, world):
-    result, _, _, rows, q29 = boot(
+    result, *_ = boot(
         seconds=8,
         faults=[[3 * SECOND, "imu", "vanish"], [int(3.1 * SECOND), "imu", "come_back"]],
     )
@@ -247,7 +244,7 @@ def test_a_board_that_never_rests_goes_on_flagged(boot, tmp_path):
 
     path = tmp_path / "hand.imu"
     motions.render("spin", rate=(1000, 1), seconds=8).write(path)
-    result, lines, picture, *_ = boot(world=str(path), seconds=8)
+    result, lines, *_ = boot(world=str(path), seconds=8)
     healthy(result)
     assert not result["bias_known"]
     assert any("never at rest" in line for line in lines)

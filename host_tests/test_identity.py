@@ -5,13 +5,23 @@ import hashlib
 import motions
 import numpy as np
 import pytest
-
 from upright import replay, scoring, simulate, trials
 
-RATES = {"static": 50, "slow": 100, "spin": 200, "bursts": 500, "coning": 1000, "hand": 200, "demo": 200}
+RATES = {
+    "static": 50,
+    "slow": 100,
+    "spin": 200,
+    "bursts": 500,
+    "coning": 1000,
+    "hand": 200,
+    "demo": 200,
+}
 SAMPLES = 600
 GAINS = {"default": {"kp": 0.5, "ki": 0.0}, "integral": {"kp": 1.0, "ki": 0.05}}
-CASES = [(name, "default") for name in motions.MOTIONS] + [("hand", "integral"), ("bursts", "integral")]
+CASES = [(name, "default") for name in motions.MOTIONS] + [
+    ("hand", "integral"),
+    ("bursts", "integral"),
+]
 
 
 @pytest.fixture(scope="module")

@@ -156,7 +156,10 @@ def test_another_bus_is_not_cut(i2c, bus):
     other = machine.wire_i2c(1, Echo())
     i2c1 = machine.I2C(1)
     machine.Timer(
-        period=1, hard=True, mode=machine.Timer.ONE_SHOT, callback=lambda t: i2c1.writeto(0x50, b"a")
+        period=1,
+        hard=True,
+        mode=machine.Timer.ONE_SHOT,
+        callback=lambda t: i2c1.writeto(0x50, b"a"),
     )
     assert len(i2c.readfrom(0x50, 100)) == 100
     assert (bus.cuts, other.cuts, other.transfers) == (0, 0, 1)

@@ -6,7 +6,6 @@ import sys
 
 import pytest
 from typer.testing import CliRunner
-
 from upright import cli, debian, paths, runtimes
 
 
@@ -29,7 +28,9 @@ def test_a_script_gets_its_arguments_and_the_boards_modules(runtime, tmp_path):
 
 def test_each_micropython_is_what_it_is_named_for(micropython_runtime, tmp_path):
     script = tmp_path / "script.py"
-    script.write_text("import sys\nprint(sys.maxsize > 1 << 32, sys.implementation._mpy >> 10 & 15)\n")
+    script.write_text(
+        "import sys\nprint(sys.maxsize > 1 << 32, sys.implementation._mpy >> 10 & 15)\n"
+    )
     is_64, arch = runtimes.run(micropython_runtime, script).stdout.split()
     assert is_64 == str(micropython_runtime == "unix")
     if micropython_runtime == "arm":

@@ -46,7 +46,9 @@ def test_rp2_gets_a_hard_timer_of_exact_microseconds(port):
     assert ticker.timer.stopped
 
 
-@pytest.mark.parametrize("refuses", [TypeError("unexpected keyword argument 'hard'"), ValueError("hard Timers")])
+@pytest.mark.parametrize(
+    "refuses", [TypeError("unexpected keyword argument 'hard'"), ValueError("hard Timers")]
+)
 def test_a_port_without_hard_timers_gets_a_soft_one_and_says_so(port, refuses):
     port(refuses)
     ticker = timing.make_tick(200, print, microseconds=False)

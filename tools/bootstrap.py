@@ -32,7 +32,9 @@ def pip_wheel(folder):
     sys.path.insert(0, str(ROOT / "tools"))
     from upright.debian import Apt, AptError
 
-    print("setup: no ensurepip here (python3-venv is not installed): fetching pip's wheel from Debian")
+    print(
+        "setup: no ensurepip here (python3-venv is not installed): fetching pip's wheel from Debian"
+    )
     try:
         native = subprocess.run(
             ["dpkg", "--print-architecture"], capture_output=True, text=True, check=True
@@ -48,7 +50,7 @@ def pip_wheel(folder):
 
 
 def make():
-    if sys.version_info < (3, 11):
+    if sys.version_info < (3, 11):  # noqa: UP036  (this file runs before anything could check)
         fail(f"needs Python 3.11 or newer, this is {sys.version.split()[0]}")
     print(f"setup: making {VENV.name} with Python {sys.version.split()[0]}", flush=True)
     has_pip = importlib.util.find_spec("ensurepip") is not None
@@ -59,7 +61,11 @@ def make():
     install = ["install", "--disable-pip-version-check", "-c", str(ROOT / "tools/constraints.txt")]
     install += ["-e", f"{ROOT}[test]"]
     with tempfile.TemporaryDirectory() as folder:
-        pip = [str(PYTHON), "-m", "pip"] if has_pip else [str(PYTHON), f"{pip_wheel(Path(folder))}/pip"]
+        pip = (
+            [str(PYTHON), "-m", "pip"]
+            if has_pip
+            else [str(PYTHON), f"{pip_wheel(Path(folder))}/pip"]
+        )
         if not has_pip and subprocess.run([*pip, "install", "-q", "pip"]).returncode:
             fail("pip could not be installed, see above")
         if subprocess.run([str(PYTHON), "-m", "pip", *install], env=os.environ).returncode:

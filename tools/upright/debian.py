@@ -75,7 +75,7 @@ class Apt:
         return sorted({n if ":" in n else f"{n}:{native}" for n in names})
 
     def download(self, packages: list[str], step) -> None:
-        """Fetch the packages into debs/; apt checks signatures and hashes. step(percent, text) is told how far it is."""
+        """Fetch the packages into debs/; apt checks signatures and hashes. step(percent, text) tells how far it is."""
         argv = ["apt-get", *self.options, "-o", "APT::Status-Fd=1", "download", *packages]
         with subprocess.Popen(
             argv,

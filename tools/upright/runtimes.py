@@ -244,7 +244,10 @@ def command(name: str, script: str | Path, args=(), board: str = "sim") -> tuple
         folders = [paths.SHIM, *folders]
         environment["PYTHONPATH"] = ":".join(map(str, folders))
         # The shim prepares `time`: it has to come before the script, whose first import may be time.
-        launch = "import micropython, runpy, sys; sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
+        launch = (
+            "import micropython, runpy, sys; sys.argv = sys.argv[1:];"
+            " runpy.run_path(sys.argv[0], run_name='__main__')"
+        )
         start = [*start, "-c", launch]
     else:
         environment["MICROPYPATH"] = ":".join(map(str, folders))
