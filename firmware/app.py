@@ -57,7 +57,11 @@ class App:
     # ------------------------------------------------------------------------------------ start
 
     def run(self):
-        self.start()
+        try:
+            self.start()
+        except ValueError as why:  # a setting that cannot be had: board.py has to change
+            self.say("Wrong setting", str(why))
+            raise
         while True:
             self.poll()
             machine.idle()

@@ -106,6 +106,8 @@ class Tick:
             if self.steps == self._seen:
                 self._imu.read()
                 self._imu.health()
+                if self._display is not None:  # which is to show that the sensor is lost
+                    self._display.flush_step(self._chunk)
             self._seen = self.steps
         except Exception as error:
             self._crashed(error)

@@ -229,6 +229,16 @@ def test_a_chip_that_resets_itself_is_put_right_in_flight(boot, drive):
     assert result["fresh"] > expected - 100  # at most half a second without
 
 
+@pytest.mark.parametrize("drive", ["timer", "data_ready", "fifo"])
+def test_a_sensor_that_is_gone_for_good_is_shown_on_the_display(boot, drive):
+    config = {"seconds": 5, "board": {"DRIVE": drive, "SENSOR_RATE_HZ": 200, "PAGE_SECONDS": 0}}
+    *_, well = boot(**config)[:3]
+    result, _, picture, *_ = boot(**config, faults=[[3 * SECOND, "imu", "vanish"]])
+    healthy(result)
+    lit = [sum(map(sum, rows[-8:])) for rows in (well, picture)]
+    assert lit[1] > lit[0] + 300  # the status line is inverse
+
+
 def test_a_stuck_bus_costs_time_not_the_program(boot):
     result, *_ = boot(
         seconds=6, faults=[[3 * SECOND, "bus", "stuck", True], [4 * SECOND, "bus", "stuck", False]]

@@ -196,6 +196,14 @@ def test_an_empty_fifo_is_a_reason_to_look_at_the_chip(imu, filter):
     assert (tick.steps, imu.healths) == (0, 1)
 
 
+def test_the_guard_goes_on_with_the_display_when_samples_stop(imu, filter):
+    display = Display()
+    tick = Tick(imu, filter, PERIOD, display)
+    tick._seen = tick.steps
+    tick.on_guard(None)
+    assert display.asked == [32]
+
+
 def test_the_guard_looks_at_a_chip_that_has_fallen_silent(tick, imu):
     ticks_at(tick, [5000])
     before = imu.healths
