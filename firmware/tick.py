@@ -4,6 +4,8 @@
 from array import array
 from time import ticks_add, ticks_diff, ticks_us
 
+import micropython
+
 _Q = 0  # published: quaternion Q29, then flags of the last sample and the number of steps
 _FLAGS = 4
 _STEPS = 5
@@ -20,6 +22,10 @@ _HEALTH_EVERY = 8  # ticks between two looks at a configuration register while s
 _MOST_COASTS = (
     16  # steps made up for at once: bounds the tick, and past it the last rate says nothing
 )
+
+
+# The callbacks are native code for their frames' sake: a bytecode frame over 11 words, which a `try` soon makes, is
+# taken from the heap where it is not locked. The small methods below them stay under that.
 
 
 class Tick:
@@ -61,6 +67,7 @@ class Tick:
         self.on_fifo = self._on_fifo
         self.on_guard = self._on_guard
 
+    @micropython.native
     def _on_sample(self, source):
         if self._inside:  # another source of the same tick, at a higher priority
             return
@@ -77,6 +84,7 @@ class Tick:
             self._crashed(error)
         self._inside = False
 
+    @micropython.native
     def _on_fifo(self, source):
         if self._inside:
             return
@@ -96,6 +104,7 @@ class Tick:
             self._crashed(error)
         self._inside = False
 
+    @micropython.native
     def _on_guard(self, source):
         """Slow timer beside the data-ready line: a chip that has reset itself raises it no more, and has to be
         found and put right all the same."""

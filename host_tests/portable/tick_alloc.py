@@ -1,0 +1,134 @@
+# Does the firmware's tick allocate? 10,000 ticks of every drive, whole: driver, filter, published state, display.
+# With the heap locked, and with it open on a bus that itself allocates nothing; also what a tick borrows and gives
+# back (a bytecode frame over 11 words). Runs on every MicroPython; exits with 1 if one failed.
+
+import gc
+import sys
+
+import micropython
+import utime
+
+sys.modules["time"] = utime  # the built-in one, also where the simulator's is on the path
+
+import tick as ticks  # noqa: E402
+from mahony import Mahony6  # noqa: E402
+from mpu6050 import MPU6050  # noqa: E402
+from ssd1306 import SSD1306_I2C  # noqa: E402
+
+TICKS = 10000
+
+
+class Bus:
+    """An MPU6050 that is nothing but memory, and a display that takes all. No call here allocates."""
+
+    def __init__(self):
+        self.memory = bytearray(128)
+        self.memory[0x75] = 0x68
+        self.word = 0
+        self.watching = False
+        self.base = 0
+        self.peak = 0
+
+    def readfrom_mem_into(self, address, register, buffer):
+        if register == 0x72:
+            buffer[0] = 0
+            buffer[1] = 42
+        elif register == 0x3A or register == 0x74:
+            self.word = (self.word + 37) & 0xFF
+            for i in range(len(buffer)):
+                buffer[i] = 0
+            buffer[0] = 1 if register == 0x3A else 0
+            if len(buffer) > 2:
+                buffer[1] = buffer[8] = self.word
+        else:
+            for i in range(len(buffer)):
+                buffer[i] = self.memory[register + i]
+        if self.watching:
+            self.look()
+
+    def writeto(self, address, buffer):
+        if address == 0x68:
+            self.memory[buffer[0]] = buffer[1] & 0x7F if buffer[0] == 0x6B else buffer[1]
+        if self.watching:
+            self.look()
+
+    def look(self):
+        taken = gc.mem_alloc() - self.base
+        if taken > self.peak:
+            self.peak = taken
+
+
+class FloatFilter(Mahony6):
+    """The twin that must be found out: one float in the tick."""
+
+    half = 0.5
+
+    def update(self, counts):
+        Mahony6.update(self, counts)
+        FloatFilter.half = FloatFilter.half * 0.99
+
+
+def build(kind):
+    bus = Bus()
+    imu = MPU6050(bus)
+    imu.configure(settle=False)
+    filter = kind(1000, imu.gyro_scale, imu.accel_lsb_per_g, 0.5, 0.01)
+    display = SSD1306_I2C(bus)
+    display.begin()
+    # ticks_us runs on: whether ticks were missed does not matter, coasting may not allocate either
+    return bus, imu, display, ticks.Tick(imu, filter, 1000, display, 32)
+
+
+def run(callback, display, n):
+    for i in range(n):
+        if not display.busy:
+            display.fill(i & 1)  # drawing is the main program's, and may not allocate either
+            display.show()
+        callback(None)
+
+
+def check(drive):
+    bus, imu, display, tick = build(Mahony6)
+    if drive == "on_fifo":
+        imu.fifo_enable()
+    callback = getattr(tick, drive)
+    run(callback, display, 100)
+    refused = 0
+    micropython.heap_lock()
+    try:
+        run(callback, display, TICKS)
+    except MemoryError:
+        refused = 1
+    micropython.heap_unlock()
+    gc.collect()
+    gc.disable()
+    before = gc.mem_alloc()
+    run(callback, display, TICKS // 5)
+    grown = gc.mem_alloc() - before
+    bus.base = gc.mem_alloc()
+    bus.watching = True
+    run(callback, display, 40)
+    gc.enable()
+    crashes = tick.crashes + refused
+    steps = 0 if drive == "on_guard" else TICKS  # the guard makes none
+    ok = not crashes and not grown and not bus.peak and tick.steps >= steps
+    print(
+        drive, "ok" if ok else "ALLOCATES", "refused", crashes, "grown", grown, "borrowed", bus.peak
+    )
+    return ok
+
+
+def twin():
+    _, _, display, tick = build(FloatFilter)
+    run(tick.on_sample, display, 10)
+    before = tick.crashes
+    micropython.heap_lock()
+    tick.on_sample(None)
+    micropython.heap_unlock()
+    found = tick.crashes > before
+    print("a float in the tick:", "found" if found else "MISSED")
+    return found
+
+
+results = [check(drive) for drive in ("on_sample", "on_fifo", "on_guard")] + [twin()]
+sys.exit(0 if all(results) else 1)
