@@ -1,0 +1,70 @@
+# 10,000 updates and conversions with the heap locked, then again with the allocated bytes counted.
+# Arguments: [float | list]: also do something in every step that allocates, to show that it is
+# caught.
+
+import gc
+import sys
+from array import array
+
+import fixmath
+import micropython
+from mahony import Mahony6
+
+UPDATES = 10000
+waste = sys.argv[1] if len(sys.argv) > 1 else ""
+
+
+def row(*values):
+    return array("h", values)
+
+
+# level, tilted, upside down, free fall, accelerometer and gyro at full scale, stale
+ROWS = (
+    row(0, 0, 4096, 10, -10, 5, 0, 0, 0, 0, 1),
+    row(2000, -3000, 1500, 3000, -2000, 500, 0, 0, 0, 0, 1),
+    row(-900, 100, -4000, -300, 20, 32767, 0, 0, 0, 0, 9),
+    row(0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1),
+    row(32767, -32768, 32767, -32768, 32767, -32768, 0, 0, 0, 0, 5),
+    row(32767, -32768, 32767, 32767, 32767, 32767, 0, 0, 0, 0, 1),
+    row(100, 200, 4000, 1000, -1000, 1000, 0, 0, 0, 0, 0),
+)
+filter = Mahony6(200, (82, 5), 4096, 1, 0.1)
+filter.set_bias(100, -200, 300)
+quaternion = array("i", [0, 0, 0, 0])
+angles = array("i", [0, 0, 0])
+
+
+def run(n):
+    i = 0
+    while n:
+        filter.update(ROWS[i])
+        filter.quaternion(quaternion)
+        filter.angles(angles)
+        fixmath.euler(quaternion, angles, "zxy")
+        if waste == "float":
+            abs(n * 0.5)
+        elif waste == "list":
+            len([n])
+        i += 1
+        if i == 7:
+            i = 0
+        n -= 1
+
+
+filter.seed(ROWS[0])
+run(7)
+micropython.heap_lock()
+try:
+    run(UPDATES)
+    print("locked: nothing allocated")
+except MemoryError:
+    print("locked: MemoryError")
+finally:
+    micropython.heap_unlock()
+
+if hasattr(gc, "mem_alloc"):
+    gc.collect()
+    gc.disable()
+    before = gc.mem_alloc()
+    run(1000)
+    print("bytes allocated:", gc.mem_alloc() - before)

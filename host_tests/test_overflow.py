@@ -1,0 +1,198 @@
+"""No intermediate result of the viper kernels leaves 32 bits, at the corners of what the filter accepts."""
+
+import math
+import random
+from array import array
+from pathlib import Path
+
+import overflow
+import pytest
+
+LIB = Path(__file__).resolve().parents[1] / "lib"
+SCALES = {250: (131, 1), 500: (131, 2), 1000: (164, 5), 2000: (82, 5)}
+ONE = 1 << 29
+
+
+@pytest.fixture(scope="module")
+def checked():
+    """(watch, fixmath, mahony) with checked viper functions; at the end nothing may have gone unexercised."""
+    watch = overflow.Watch()
+    modules = overflow.loaded([LIB / "fixmath.py", LIB / "mahony.py"], watch)
+    return watch, modules["fixmath"], modules["mahony"]
+
+
+def accepted(make, value):
+    try:
+        make(value)
+    except ValueError:
+        return False
+    return True
+
+
+def largest(make, low, high):
+    """The largest integer in low..high that `make` accepts; it must accept low and refuse high."""
+    assert accepted(make, low) and not accepted(make, high)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if accepted(make, middle) else (low, middle)
+    return low
+
+
+def corners(mahony):
+    """(rate, full scale, kp, ki, bias limit) at the ends of the ranges that the constructor accepts."""
+    out = []
+    for fsr, limit in ((2000, 20), (2000, 250), (250, 20), (500, 0)):
+
+        def make(rate, kp=0, ki=0, fsr=fsr, limit=limit):
+            return mahony.Mahony6(rate, SCALES[fsr], 2048, kp, ki, limit)
+
+        slow = -largest(lambda v, make=make: make(-v), -100, -1)
+        fast = largest(make, 1000, 1 << 20)
+        for rate in (slow, 50 if slow <= 50 else 200, 8000, fast):
+            kp = largest(lambda v, r=rate, make=make: make(r, kp=v / 1000), 0, 10**9) / 1000
+            ki = largest(lambda v, r=rate, make=make: make(r, ki=v / 1000), 0, 10**11) / 1000
+            out.append((rate, fsr, kp, min(ki, 1e6), limit))
+    out.append((50, 2000, 20, 1, 20))
+    return out
+
+
+def random_quaternion(rng):
+    v = [rng.gauss(0, 1) for _ in range(4)]
+    if rng.random() < 0.3:
+        v = [rng.choice((-1, 0, 0, 1)) for _ in range(4)]
+    if not any(v):
+        v = [0, 0, 1, 0]
+    r = math.sqrt(sum(x * x for x in v))
+    return [round(x / r * ONE) for x in v]
+
+
+def with_extreme_low_parts(rng, values, bits):
+    """The values with their low `bits` bits where a centred split leaves the largest remainder."""
+    half = 1 << (bits - 1)
+    return [(v >> bits << bits) + rng.choice((half - 1, half, -half + 1)) for v in values]
+
+
+def extreme_counts(rng):
+    def word():
+        c = rng.random()
+        if c < 0.5:
+            return rng.choice((-32768, 32767))
+        return rng.randint(-32768, 32767) if c < 0.8 else rng.randint(-1200, 1200)
+
+    flags = rng.choice((0, 1, 1, 1, 1, 3, 5, 9))
+    return array("h", [word() for _ in range(10)] + [flags])
+
+
+def test_nothing_leaves_32_bits_at_the_corners_of_the_accepted_range(checked):
+    _, _, mahony = checked
+    rng = random.Random(1)
+    out = array("i", bytes(12))
+    limit = 8192 * 256
+    for rate, fsr, kp, ki, bias_limit in corners(mahony):
+        filter = mahony.Mahony6(rate, SCALES[fsr], 2048, kp, ki, bias_limit)
+        s = filter.state
+        for i in range(250):
+            if i % 5 == 0:
+                filter.set_bias(*(rng.choice((-limit, limit, 0)) for _ in range(3)))
+                s[1:5] = array("i", with_extreme_low_parts(rng, random_quaternion(rng), 15))
+                for j in range(3):
+                    s[mahony._I + j] = n = rng.choice((-1, 0, 1)) * s[mahony._I_MAX]
+                    s[mahony._O + j] = (n >> s[mahony._I_SHIFT]) - s[mahony._B + j]
+                    s[mahony._IR + j] = (1 << s[mahony._KI_SHIFT]) - 1
+                    s[mahony._WR + j] = 32767
+            counts = extreme_counts(rng)
+            if i % 7 == 0:  # everything on one side: gyro and bias against each other on all axes
+                for j in range(3):
+                    counts[3 + j] = -32768 if filter._bias[j] > 0 else 32767
+            filter.update(counts)
+            filter.angles(out, rng.choice(("zyx", "zxy")))
+            assert abs(math.hypot(*s[1:5]) / ONE - 1) < 1e-3
+
+
+def test_nothing_leaves_32_bits_in_the_kernels_at_their_own_limits(checked):
+    """Beyond what the filter feeds them: every half angle below 1 rad, every vector, every attitude."""
+    _, fixmath, _ = checked
+    rng = random.Random(2)
+    out = array("i", bytes(12))
+    s = array("i", bytes(4 * fixmath.OWN))
+    s[0] = -1
+    for i in range(4000):
+        q = random_quaternion(rng)
+        s[1:5] = array("i", with_extreme_low_parts(rng, q, 15) if i & 1 else q)
+        for j in range(4):
+            s[fixmath.QR + j] = rng.choice((0, 32767))
+        d = [rng.choice((-1, 1, 0.01, rng.gauss(0, 1))) for _ in range(3)]
+        if (
+            i % 3 == 0
+        ):  # along the quaternion's own vector part, where the sums of products are largest
+            d = [v or 1e-9 for v in q[1:]]
+        norm = math.sqrt(sum(v * v for v in d))
+        size = 0x7FFEFFFF * rng.choice((1, 1, rng.random(), rng.random() ** 4))
+        w = [int(v / norm * size) for v in d]
+        s[fixmath.W : fixmath.W + 3] = array("i", w)
+        for j in range(3):
+            s[fixmath.WR + j] = rng.choice((0, 32767))
+        s[fixmath.LOW] = 4
+        counts = extreme_counts(rng)
+        if i % 5 == 0:
+            counts[0], counts[1], counts[2] = rng.randint(-9, 9), rng.randint(-9, 9), 4
+        fixmath.tilt(s, counts)
+        fixmath.euler(s[1:5], out, ("zyx", "zxy")[i & 1])
+        fixmath.turn(s)
+        assert abs(math.hypot(*s[1:5]) / ONE - 1) < 1e-4
+
+
+def test_every_operation_of_every_viper_function_was_exercised(checked):
+    """Runs last in this file; the two tests above must leave nothing out."""
+    watch, _, _ = checked
+    if not watch.called:
+        pytest.skip("needs the other tests of this file")
+    assert watch.missed() == []
+    assert watch.functions == {
+        "fixmath.tilt",
+        "fixmath.turn",
+        "fixmath._euler",
+        "mahony._drive",
+    }
+
+
+SOURCE = """
+import micropython
+@micropython.viper
+def square(s: ptr32, x: int) -> int:
+    y = x * x
+    s[0] = y >> 4
+    return s[0] >> 1
+def plain(x):
+    return x * x
+"""
+
+
+@pytest.mark.parametrize(
+    "change, x, said",
+    [
+        ("", 46341, "square, line 5: x * x = 2147488281"),
+        (("y >> 4", "y << 33"), 1, "shift by 33"),
+        (("y >> 4", "y * 4 - y + y"), 24000, "= 2304000000"),
+        (("s[0] >> 1", "x << 16"), 30000, "result 1966080000 would be boxed"),
+        ("", 1 << 30, "argument 1073741824 would be boxed"),
+        (("y = x * x", "y = x; y *= x"), 50000, "x * x"),
+    ],
+)
+def test_a_function_that_overflows_is_caught(change, x, said):
+    source = SOURCE.replace(*change) if change else SOURCE
+    module = overflow.load("twin", source, overflow.Watch())
+    module.plain(1 << 40)  # not a viper function: not held to anything
+    if x > 1:
+        module.square([0], 1)
+    with pytest.raises(overflow.Overflow) as caught:
+        module.square([0], x)
+    assert said in str(caught.value).replace("y * x", "x * x")
+
+
+def test_an_operation_that_never_ran_is_reported():
+    watch = overflow.Watch()
+    module = overflow.load("twin", SOURCE, watch)
+    assert "twin.square" in watch.missed()
+    module.square([0], 3)
+    assert watch.missed() == []

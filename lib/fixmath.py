@@ -1,0 +1,461 @@
+# Integer kernels of the attitude filters: unit vectors, gravity, turning a quaternion, Euler
+# angles. Needs the viper emitter of MicroPython, or CPython with a stand-in `micropython` module.
+# The part marked "tick" allocates nothing, raises nothing and uses no float; all of it gives the
+# same bits on every port.
+#
+# The kernels work on a filter's state, one array('i') that starts with the words below. Viper's
+# ptr32 zero-extends on 64-bit ports, so word 0 holds -1: a kernel that reads it as a positive
+# number shifts every signed load by 32 bits up and down again (`<< k >> k`). For products a
+# Q-number v is split as h = (v + half) >> b, l = v - (h << b): the centred low part l keeps sums of
+# products below 2**31 and free of a bias. docs/numerics.md has the bounds.
+
+from array import array
+
+import micropython
+from micropython import const
+
+PROBE = const(0)  # always -1
+Q = const(1)  # 4 words: quaternion w x y z, body to earth, Q29
+QR = const(5)  # 4: what rounding has left of it, 2**-44, 0..32767
+W = const(9)  # 3: half the angle of this step (rad), Q31
+WR = const(12)  # 3: what rounding has left of it, 2**-46, 0..32767
+V = const(15)  # 3: a measured vector, scaled so that its length is 2**15..2**16
+VR = const(18)  # 1: 2**30 / that length, 16384..32768
+UP = const(19)  # 3: the estimated up (gravity's reaction) in the body, Q28
+E = const(22)  # 3: the attitude error as a rotation vector in the body, Q29
+LOW = const(25)  # 1: least squared length / 4 of the accelerometer's counts that is used, 4..2**28
+OWN = const(26)  # the filter's own words follow
+
+ONE = const(1 << 29)  # 1.0 in Q29
+
+# pi to 16 digits, for set-up in integers: single-precision boards get the same gains bit for bit
+PI_NUM = 3141592653589793
+PI_DEN = 1000000000000000
+
+
+# --------------------------------------------------------------------------------------------- tick
+@micropython.viper
+def tilt(s: ptr32, counts: ptr16):
+    """Set E to (V / |V|) x UP, or to 0 where the accelerometer is not to be used.
+
+    V is the accelerometer of counts, UP row 3 of the rotation matrix of Q. E turns the estimated
+    attitude towards the one in which V points up; |E| is the sine of the angle between V and UP.
+    Not used: flags (counts[10]) with bit 0 clear (not fresh) or bit 2 set (at full scale), and a
+    squared length / 4 below LOW; V and UP then stay as they were.
+
+    1/sqrt: the quadratic of least relative error (2.4 %) on [1/4, 1], then two Newton steps (1e-6,
+    less than the rounding of VR). The relative error of VR is below 1e-4 and acts as a gain, not as
+    an offset.
+    """
+    s[E] = 0
+    s[E + 1] = 0
+    s[E + 2] = 0
+    if counts[10] & 5 != 1:
+        return
+    x = ((counts[0] & 0xFFFF) ^ 0x8000) - 0x8000
+    y = ((counts[1] & 0xFFFF) ^ 0x8000) - 0x8000
+    z = ((counts[2] & 0xFFFF) ^ 0x8000) - 0x8000
+    n = (x * x >> 2) + (y * y >> 2) + (z * z >> 2)
+    if n < s[LOW]:
+        return
+    shift = 0
+    while n < 0x10000000:  # at most 13 times
+        n <<= 2
+        shift += 1
+    x <<= shift
+    y <<= shift
+    z <<= shift
+    h0 = x >> 1
+    h1 = y >> 1
+    h2 = z >> 1
+    n = (h0 * h0 + h1 * h1 + h2 * h2) >> 15  # squared length, Q15, 1/4..1; exact where shifted
+    r = ((((26846 * n >> 15) - 53828) * n) >> 15) + 43759  # Q14
+    r = r * (49152 - (n * (r * r >> 14) >> 15)) >> 15
+    r = r * (49152 - (n * (r * r >> 14) >> 15)) >> 15
+    if r > 32768:
+        r = 32768
+    s[V] = x
+    s[V + 1] = y
+    s[V + 2] = z
+    s[VR] = r
+    k = 0
+    if s[PROBE] > 0:
+        k = 32
+    q = s[Q] << k >> k
+    h0 = (q + 16384) >> 15
+    l0 = q - (h0 << 15)
+    q = s[Q + 1] << k >> k
+    h1 = (q + 16384) >> 15
+    l1 = q - (h1 << 15)
+    q = s[Q + 2] << k >> k
+    h2 = (q + 16384) >> 15
+    l2 = q - (h2 << 15)
+    q = s[Q + 3] << k >> k
+    h3 = (q + 16384) >> 15
+    l3 = q - (h3 << 15)
+    u = ((h1 * h3 - h0 * h2) << 1) + ((h1 * l3 + l1 * h3 - h0 * l2 - l0 * h2 + 8192) >> 14)
+    v = ((h0 * h1 + h2 * h3) << 1) + ((h0 * l1 + l0 * h1 + h2 * l3 + l2 * h3 + 8192) >> 14)
+    w = h0 * h0 - h1 * h1 - h2 * h2 + h3 * h3
+    w += (h0 * l0 - h1 * l1 - h2 * l2 + h3 * l3 + 8192) >> 14
+    s[UP] = u
+    s[UP + 1] = v
+    s[UP + 2] = w
+    # the cross product of the unscaled vector, 14 bits of UP at a time; its length comes in last
+    h0 = (u + 8192) >> 14
+    h1 = (v + 8192) >> 14
+    h2 = (w + 8192) >> 14
+    l0 = u - (h0 << 14)
+    l1 = v - (h1 << 14)
+    l2 = w - (h2 << 14)
+    q = y * h2 - z * h1 + ((y * l2 - z * l1 + 8192) >> 14)
+    h3 = (q + 16384) >> 15
+    s[E] = h3 * r + (((q - (h3 << 15)) * r + 16384) >> 15)
+    q = z * h0 - x * h2 + ((z * l0 - x * l2 + 8192) >> 14)
+    h3 = (q + 16384) >> 15
+    s[E + 1] = h3 * r + (((q - (h3 << 15)) * r + 16384) >> 15)
+    q = x * h1 - y * h0 + ((x * l1 - y * l0 + 8192) >> 14)
+    h3 = (q + 16384) >> 15
+    s[E + 2] = h3 * r + (((q - (h3 << 15)) * r + 16384) >> 15)
+
+
+@micropython.viper
+def turn(s: ptr32):
+    """Turn Q by the half angle d = W, |d| < 1 rad: Q = Q (x) (cos|d|, d sin|d| / |d|), renormalised.
+
+    The closed form: 1 - sin(d)/d and 1 - cos(d) as polynomials in d**2, their integer coefficients
+    fitted near those of the series: within 2e-6 |d|**5 rad, less than the rounding below 0.3 rad.
+    The renormalisation, a factor of 1 - (|Q|**2 - 1)/2, goes into the cosine. Remainders are
+    carried in WR and QR. W becomes d sin|d| / |d|.
+    """
+    k = 0
+    if s[PROBE] > 0:
+        k = 32
+    x = s[W] << k >> k
+    y = s[W + 1] << k >> k
+    z = s[W + 2] << k >> k
+    xh = (x + 32768) >> 16
+    yh = (y + 32768) >> 16
+    zh = (z + 32768) >> 16
+    xl = x - (xh << 16)
+    yl = y - (yh << 16)
+    zl = z - (zh << 16)
+    # n = d**2, Q30
+    n = xh * xh + yh * yh + zh * zh + ((xh * xl + yh * yl + zh * zl + 16384) >> 15)
+    h = n >> 15
+    n &= 32767
+    # c = 1 - sin(d)/d = n (1/6 - n (1/120 - n (1/5040 - n/362880))), Q31
+    p = 34953 - (h * (835 - (14 * h >> 15)) >> 15)  # Q22
+    p = 715827883 - ((h * p + (n * p >> 15)) >> 5)  # Q32
+    f = (p + 32768) >> 16
+    c = h * f + (n * f >> 15) + (h * (p - (f << 16)) >> 16)
+    # f = cos(d) - 1 = -n (1/2 - n (1/24 - n (1/720 - n/40320))), Q31
+    p = 43690 - (h * (1455 - (25 * h >> 15)) >> 15)  # Q20
+    p = 536870912 - ((h * p + (n * p >> 15)) >> 5)  # Q30
+    f = (p + 32768) >> 16
+    f = 0 - (h * f << 2) - (n * f >> 13) - (h * (p - (f << 16)) >> 14)
+    # d sin(d)/|d| = d - d c
+    h = (c + 16384) >> 15
+    c -= h << 15
+    p = s[WR] - xh * c - ((xl * h + (xl * c >> 15)) >> 1)
+    s[WR] = p & 32767
+    x += (p >> 15) - xh * h
+    p = s[WR + 1] - yh * c - ((yl * h + (yl * c >> 15)) >> 1)
+    s[WR + 1] = p & 32767
+    y += (p >> 15) - yh * h
+    p = s[WR + 2] - zh * c - ((zl * h + (zl * c >> 15)) >> 1)
+    s[WR + 2] = p & 32767
+    z += (p >> 15) - zh * h
+    q0 = s[Q] << k >> k
+    q1 = s[Q + 1] << k >> k
+    q2 = s[Q + 2] << k >> k
+    q3 = s[Q + 3] << k >> k
+    h0 = (q0 + 16384) >> 15
+    h1 = (q1 + 16384) >> 15
+    h2 = (q2 + 16384) >> 15
+    h3 = (q3 + 16384) >> 15
+    l0 = q0 - (h0 << 15)
+    l1 = q1 - (h1 << 15)
+    l2 = q2 - (h2 << 15)
+    l3 = q3 - (h3 << 15)
+    # |Q|**2 - 1, Q28
+    r = h0 * h0 + h1 * h1 + h2 * h2 + h3 * h3 - 0x10000000
+    f -= (r + ((h0 * l0 + h1 * l1 + h2 * l2 + h3 * l3 + 8192) >> 14)) << 2
+    # Q += Q (x) (f, x, y, z), 16 bits of the second at a time; the last 15 bits of the sum are
+    # carried
+    n = (f + 32768) >> 16
+    xh = (x + 32768) >> 16
+    yh = (y + 32768) >> 16
+    zh = (z + 32768) >> 16
+    p = f - (n << 16)
+    xl = x - (xh << 16)
+    yl = y - (yh << 16)
+    zl = z - (zh << 16)
+    r = l0 * n - l1 * xh - l2 * yh - l3 * zh
+    r += s[QR] + ((h0 * p - h1 * xl - h2 * yl - h3 * zl) >> 1)
+    s[QR] = r & 32767
+    s[Q] = q0 + h0 * n - h1 * xh - h2 * yh - h3 * zh + (r >> 15)
+    r = l0 * xh + l1 * n + l2 * zh - l3 * yh
+    r += s[QR + 1] + ((h0 * xl + h1 * p + h2 * zl - h3 * yl) >> 1)
+    s[QR + 1] = r & 32767
+    s[Q + 1] = q1 + h0 * xh + h1 * n + h2 * zh - h3 * yh + (r >> 15)
+    r = l0 * yh - l1 * zh + l2 * n + l3 * xh
+    r += s[QR + 2] + ((h0 * yl - h1 * zl + h2 * p + h3 * xl) >> 1)
+    s[QR + 2] = r & 32767
+    s[Q + 2] = q2 + h0 * yh - h1 * zh + h2 * n + h3 * xh + (r >> 15)
+    r = l0 * zh + l1 * yh - l2 * xh + l3 * n
+    r += s[QR + 3] + ((h0 * zl + h1 * yl - h2 * xl + h3 * p) >> 1)
+    s[QR + 3] = r & 32767
+    s[Q + 3] = q3 + h0 * zh + h1 * yh - h2 * xh + h3 * n + (r >> 15)
+
+
+# -------------------------------------------- main loop: allocates nothing, shares no memory with a
+# tick atan(2**-i) in degrees, Q20 fmt: off
+_ATAN = array(
+    "i",
+    [
+        47185920,
+        27855475,
+        14718068,
+        7471121,
+        3750058,
+        1876857,
+        938658,
+        469357,
+        234682,
+        117342,
+        58671,
+        29335,
+        14668,
+        7334,
+        3667,
+        1833,
+        917,
+        458,
+        229,
+        115,
+        57,
+        29,
+        14,
+        7,
+    ],
+)
+# fmt: on
+
+
+@micropython.viper
+def _euler(q: ptr32, out: ptr32, zxy: int):
+    """euler() with the order as 0 or 1.
+
+    Both orders are the same problem: with (a, b) = (q2, q1) for zyx and (q1, -q2) for zxy,
+    (q0 + a, q3 - b) has the length cos(pitch/2) + sin(pitch/2) and the direction (yaw -+ roll)/2,
+    (q0 - a, q3 + b) has the length cos(pitch/2) - sin(pitch/2) and the direction (yaw +- roll)/2.
+    So three CORDICs without one product give all, and near gimbal lock only the direction of the
+    vanishing one is lost: the sum or difference of yaw and roll, and pitch, stay exact.
+    """
+    out[0] = 0 - 1
+    k = 0
+    if out[0] > 0:
+        k = 32
+    w = q[0] << k >> k
+    z = q[3] << k >> k
+    a = q[2] << k >> k
+    b = q[1] << k >> k
+    if zxy:
+        k = a
+        a = b
+        b = 0 - k
+    table = ptr32(_ATAN)
+    x = w + a
+    y = z - b
+    plus = 0
+    minus = 0
+    plus_length = 0
+    k = 0
+    while k < 3:
+        # CORDIC, vectoring: angle of (x, y) in degrees, Q20; x ends as 1.64676 times the length
+        angle = 0
+        if x < 0:
+            angle = 188743680  # 180
+            if y < 0:
+                angle = 0 - angle
+            x = 0 - x
+            y = 0 - y
+        i = y
+        if i < 0:
+            i = 0 - i
+        shift = 0
+        while x + i < 0x10000000 and shift < 24:
+            x <<= 1
+            y <<= 1
+            i <<= 1
+            shift += 1
+        i = 0
+        while i < 24:
+            t = y >> i
+            if y > 0:
+                y -= x >> i
+                x += t
+                angle += table[i]
+            else:
+                y += x >> i
+                x -= t
+                angle -= table[i]
+            i += 1
+        x >>= shift
+        if k == 0:
+            plus = angle
+            plus_length = x
+            x = w - a
+            y = z + b
+        elif k == 1:
+            minus = angle
+            # lock: the shorter one has no direction left; take roll as 0
+            if x < 1024:
+                minus = plus
+            elif plus_length < 1024:
+                plus = minus
+            y = x >> 1
+            x = plus_length >> 1
+        k += 1
+    out[1] = (((94371840 - (angle << 1)) >> 5) * 125 + 2048) >> 12  # 90 - 2 angle
+    x = minus - plus
+    if zxy:
+        x = 0 - x
+    y = minus + plus
+    k = 0
+    while k < 3:
+        if x > 188743680:
+            x -= 377487360
+        elif x < 0 - 188743680:
+            x += 377487360
+        out[k] = ((x >> 5) * 125 + 2048) >> 12
+        x = y
+        k += 2
+
+
+def euler(q, out, order="zyx"):
+    """Euler angles of the quaternion q in integer millidegrees: roll, pitch, yaw in out[0..2].
+
+    q: array('i') whose first 4 words are w x y z in Q29, of unit length. out: array('i') of 3 words
+    or more, the only memory that is written, so that a tick may convert while the main loop does.
+    Allocates nothing.
+
+    order 'zyx': R = Rz(yaw) Ry(pitch) Rx(roll), as in aerospace. 'zxy': R = Rz(yaw) Rx(pitch)
+    Ry(roll), with pitch about the x and roll about the y axis. In both yaw is right-handed about
+    up. Roll and yaw are in -180000..180000, pitch in -90000..90000; the error is below 1
+    millidegree at any attitude.
+
+    Gimbal lock: at pitch = +-90 deg roll and yaw turn about the same axis. Closer than 2e-4 deg to
+    it roll is given as 0 and yaw as the whole turn. Raises ValueError for another order.
+    """
+    if order == "zyx":
+        _euler(q, out, 0)
+    elif order == "zxy":
+        _euler(q, out, 1)
+    else:
+        raise ValueError("order %r is not 'zyx' or 'zxy'" % (order,))
+
+
+# ------------------------------------------------------------------------------------------ set-up:
+# allocates
+def isqrt(n):
+    """The integer part of the square root of n >= 0, of any size."""
+    if n < 2:
+        return n
+    x = 1 << ((_bits(n) + 1) >> 1)
+    while True:
+        y = (x + n // x) >> 1
+        if y >= x:
+            return x
+        x = y
+
+
+def ratio(num, den):
+    """num / den of integers, den > 0, to the nearest integer (halves away from zero)."""
+    if num < 0:
+        return -((-2 * num + den) // (2 * den))
+    return (2 * num + den) // (2 * den)
+
+
+def mantissa(num, den, least_shift, most_shift):
+    """(m, s) with num/den = m / 2**s as nearly as 8192 <= m < 16384 allows.
+
+    s stays within the shifts given, so a small number gets a shorter m. Returns None for num/den
+    too large.
+    """
+    s = least_shift
+    if ratio(num << s, den) > 16383:
+        return None
+    while s < most_shift and ratio(num << (s + 1), den) <= 16383:
+        s += 1
+    return ratio(num << s, den), s
+
+
+def quantise(value, name):
+    """A number >= 0 in integer millionths, to six significant digits.
+
+    A gain written with up to six digits gives the same integer from single- and double-precision
+    floats. Raises TypeError for what is not a number, ValueError for one that is negative, not
+    finite or beyond 1e9.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise TypeError("%s is %r, expected a number" % (name, value))
+    if not 0 <= value < 1e9:
+        raise ValueError("%s is %r, expected a number from 0 to 1e9" % (name, value))
+    if isinstance(value, int):
+        return value * 1000000
+    units = 1
+    while value * 1000000 / units >= 999999.5:
+        units *= 10
+    return int(value * 1000000 / units + 0.5) * units
+
+
+def unit_quaternion(w, x, y, z):
+    """(w, x, y, z), any 4 ints or floats that are not all 0, at unit length in Q29 (a tuple of ints).
+
+    Raises ValueError when all are 0 or one is not finite.
+    """
+    parts = (w, x, y, z)
+    largest = max([abs(v) for v in parts])
+    if largest != largest or not 0 < largest < float("inf") or sum(parts) != sum(parts):
+        raise ValueError("quaternion (%r, %r, %r, %r) has no direction" % parts)
+    if not all([isinstance(v, int) for v in parts]):
+        scale = 1.0
+        while largest * scale < 1073741824.0:
+            scale *= 2
+        while largest * scale >= 2147483648.0:
+            scale /= 2
+        parts = [int(v * scale) for v in parts]
+    # a few bits to spare under the root
+    norm = isqrt((parts[0] ** 2 + parts[1] ** 2 + parts[2] ** 2 + parts[3] ** 2) << 64)
+    return tuple([ratio(v << 61, norm) for v in parts])
+
+
+def level(x, y, z):
+    """The attitude with yaw 0 (order zyx) in which the body vector (x, y, z), ints, points up.
+
+    Returns (w, x, y, z) in Q29: roll = atan2(y, z), pitch = atan2(-x, hypot(y, z)). Raises
+    ValueError for the vector 0.
+    """
+    if x == 0 and y == 0 and z == 0:
+        raise ValueError("the vector (0, 0, 0) points nowhere")
+    side = isqrt((y * y + z * z) << 64)
+    norm = isqrt((x * x + y * y + z * z) << 64)
+    pitch_c, pitch_s = _half(side, -x << 32, norm)
+    roll_c, roll_s = _half(z << 32, y << 32, side) if side else (1, 0)
+    return unit_quaternion(pitch_c * roll_c, pitch_c * roll_s, pitch_s * roll_c, -pitch_s * roll_s)
+
+
+def _half(c, s, r):
+    """(cos, sin) of half the angle whose cos and sin are c/r and s/r, times any positive number."""
+    if c >= 0:
+        return r + c, s
+    return (s, r - c) if s >= 0 else (-s, c - r)
+
+
+def _bits(n):
+    bits = 0
+    while n:
+        n >>= 1
+        bits += 1
+    return bits
