@@ -46,7 +46,7 @@ class App:
         self.bias_known = False
         self.angles = array("i", [0] * 3)  # roll, pitch, yaw in millidegrees
         self.rate_hz = 0
-        self._snapshot = array("i", [0] * 6)
+        self._snapshot = array("i", [0] * ticks.SNAPSHOT_WORDS)
         self._page = 0
         self._pages = None
         self._frame_at = self._rate_at = self._page_at = self._fresh_at = time.ticks_ms()

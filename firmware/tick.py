@@ -1,31 +1,60 @@
 # The tick: sample, filter, published state, a bounded piece of the display. Runs in a hard interrupt.
-# Needs a driver of lib/ (read, health, counts) and a filter of lib/ (update, quaternion). Every port.
+# Needs a driver of lib/ (read, health, counts), a filter of lib/ (update, state) and viper. Every port.
 
 from array import array
 from time import ticks_add, ticks_diff, ticks_us
 
 import micropython
+from micropython import const
 
-_Q = 0  # published: quaternion Q29, then flags of the last sample and the number of steps
-_FLAGS = 4
-_STEPS = 5
-_WORDS = 6
+# The published state, array('i'): a sequence number that is odd while the rest is being written, quaternion Q29
+# (w x y z), flags of the last sample, number of steps, number of those with a fresh sample.
+_SEQUENCE = const(0)
+_Q = const(1)
+_FLAGS = const(5)
+_STEPS = const(6)
+_FRESH_STEPS = const(7)
+_WORDS = const(8)
+SNAPSHOT_WORDS = const(7)  # what snapshot() gives: the state from _Q on
 
 # The timer's clock is the one that ticks_us shows, give or take make_tick's rounding (100 ppm: 0.1 of a period behind).
-FOLLOW_TIMER = 10
+FOLLOW_TIMER = const(10)
 # The chip's clock on the data-ready line may be off by some percent (2 %: 0.64 of a period behind).
-FOLLOW_CHIP = 5
+FOLLOW_CHIP = const(5)
 
-_FRESH = 1
-_WRAP = 0x3FFFFFFF  # counters stay small ints
-_HEALTH_EVERY = 8  # ticks between two looks at a configuration register while samples come in
-_MOST_COASTS = (
-    16  # steps made up for at once: bounds the tick, and past it the last rate says nothing
-)
+_FRESH = const(1)
+_WRAP = const(0x3FFFFFFF)  # counters stay small ints
+# Steps between two looks at a configuration register while samples come in: a power of 2
+_HEALTH_EVERY = const(8)
+# Steps made up for at once: bounds the tick; past it the last rate says nothing
+_MOST_COASTS = const(16)
 
 
-# The callbacks are native code for their frames' sake: a bytecode frame over 11 words, which a `try` soon makes, is
-# taken from the heap where it is not locked. The small methods below them stay under that.
+@micropython.viper
+def _publish(state: ptr32, q: ptr32, counts: ptr16) -> int:
+    """Write the state of this step; 1 when the chip's health is due: now and then, and after every sample that failed.
+
+    The sequence is odd meanwhile: whoever reads then, from another core or a nested interrupt, sees that.
+    """
+    sequence = state[_SEQUENCE] + 1
+    state[_SEQUENCE] = sequence & _WRAP
+    i = 0
+    while i < 4:
+        state[_Q + i] = q[i]
+        i += 1
+    flags = counts[10]
+    state[_FLAGS] = flags
+    steps = (state[_STEPS] + 1) & _WRAP
+    state[_STEPS] = steps
+    state[_FRESH_STEPS] = (state[_FRESH_STEPS] + (flags & _FRESH)) & _WRAP
+    state[_SEQUENCE] = (sequence + 1) & _WRAP
+    if flags & _FRESH and steps & (_HEALTH_EVERY - 1):
+        return 0
+    return 1
+
+
+# The methods of the tick are native code: it takes half the time, and a bytecode frame over 11 words, which a `try`
+# soon makes, would come from the heap where that is not locked.
 
 
 class Tick:
@@ -53,13 +82,9 @@ class Tick:
         self._started = False
         self._made_up = 0
         self._inside = False
-        self._since_health = 0
         self._seen = -1
         self._state = array("i", [0] * _WORDS)
-        self._q = array("i", [0] * 4)
-        self._sequence = 0
-        self.steps = 0
-        self.fresh = 0
+        self._q = memoryview(filter.state)[filter.QUATERNION : filter.QUATERNION + 4]
         self.missed = 0
         self.crashes = 0
         self.error = None
@@ -112,12 +137,12 @@ class Tick:
             return
         self._inside = True
         try:
-            if self.steps == self._seen:
+            if self._state[_STEPS] == self._seen:
                 self._imu.read()
                 self._imu.health()
                 if self._display is not None:  # which is to show that the sensor is lost
                     self._display.flush_step(self._chunk)
-            self._seen = self.steps
+            self._seen = self._state[_STEPS]
         except Exception as error:
             self._crashed(error)
         self._inside = False
@@ -126,6 +151,7 @@ class Tick:
         self.crashes = (self.crashes + 1) & _WRAP
         self.error = error
 
+    @micropython.native
     def _on_time(self):
         """Coast through ticks that never came. False: this tick is one that was made up for and came late.
 
@@ -135,19 +161,22 @@ class Tick:
         period = self._period
         if period == 0:
             return True
-        late = ticks_diff(ticks_us(), self._due)
+        due = self._due
+        late = ticks_diff(ticks_us(), due)
         if not self._started:
             self._started = True
-            self._due = ticks_add(self._due, late + period)
+            self._due = ticks_add(due, late + period)
             return True
         if late >= period:
             self._coast(late // period)
-        elif late < -(period >> 1) and self._made_up:
-            self._made_up -= 1
-            return False
-        elif late < period >> 1:
-            self._made_up = 0
-        self._due = ticks_add(self._due, period + (late >> self._follow))
+            due = self._due
+        elif self._made_up:
+            if late < -(period >> 1):
+                self._made_up -= 1
+                return False
+            if late < period >> 1:
+                self._made_up = 0
+        self._due = ticks_add(due, period + (late >> self._follow))
         return True
 
     def _coast(self, lost):
@@ -161,43 +190,35 @@ class Tick:
             self._filter.update(self._counts)
             lost -= 1
 
+    @micropython.native
     def _step(self):
-        self._filter.update(self._counts)
-        self.steps = (self.steps + 1) & _WRAP
-        if self._counts[10] & _FRESH:
-            self.fresh = (self.fresh + 1) & _WRAP
-            self._since_health += 1
-            if self._since_health >= _HEALTH_EVERY:
-                self._since_health = 0
-                self._imu.health()
-        else:
+        counts = self._counts
+        self._filter.update(counts)
+        if _publish(self._state, self._q, counts):
             self._imu.health()
-        self._publish()
 
-    def _publish(self):
-        # Odd while it is being written: whoever reads meanwhile, from another core or a nested interrupt, sees that.
-        self._sequence = (self._sequence + 1) & _WRAP
-        state = self._state
-        q = self._q
-        self._filter.quaternion(q)
-        state[_Q] = q[0]
-        state[_Q + 1] = q[1]
-        state[_Q + 2] = q[2]
-        state[_Q + 3] = q[3]
-        state[_FLAGS] = self._counts[10]
-        state[_STEPS] = self.steps
-        self._sequence = (self._sequence + 1) & _WRAP
+    # -- for the main program
+    @property
+    def steps(self):
+        """Steps of the filter, ticks made up for not counted."""
+        return self._state[_STEPS]
+
+    @property
+    def fresh(self):
+        """Steps that had a fresh sample."""
+        return self._state[_FRESH_STEPS]
 
     def snapshot(self, out):
-        """Copy the published state (quaternion Q29 x4, flags, steps) into out, an array('i') of 6: all of one step.
+        """Copy the published state into out, an array('i') of SNAPSHOT_WORDS, all of one step: quaternion Q29
+        (w x y z), flags, steps, steps with a fresh sample.
 
         -> False when the tick never left it alone for long enough (then out is not to be used).
         """
         state = self._state
         for _ in range(100):
-            before = self._sequence
-            for i in range(_WORDS):
-                out[i] = state[i]
-            if before == self._sequence and not before & 1:
+            before = state[_SEQUENCE]
+            for i in range(SNAPSHOT_WORDS):
+                out[i] = state[_Q + i]
+            if before == state[_SEQUENCE] and not before & 1:
                 return True
         return False

@@ -42,17 +42,18 @@ class Imu:
 class Filter:
     """Remembers the flags and the first word of every sample; its quaternion is the number of steps."""
 
+    QUATERNION = 1
+
     def __init__(self):
         self.flags = []
         self.words = []
+        self.state = array("i", [0] * 6)
 
     def update(self, counts):
         self.flags.append(counts[10])
         self.words.append(counts[0])
-
-    def quaternion(self, out):
         for i in range(4):
-            out[i] = len(self.flags)
+            self.state[1 + i] = len(self.flags)
 
 
 class Display:
@@ -250,7 +251,7 @@ def interrupted(tick, times):
 def test_a_snapshot_is_never_torn(tick, times):
     ticks_at(tick, [5000])
     interrupted(tick, times)
-    out = array("i", [0] * 6)
+    out = array("i", [0] * 7)
     assert tick.snapshot(out)
     assert len(set(out[:4])) == 1
     assert out[5] == out[0]  # the steps of the same step
@@ -259,18 +260,18 @@ def test_a_snapshot_is_never_torn(tick, times):
 def test_a_plain_copy_of_the_state_would_be_torn(tick):
     ticks_at(tick, [5000])
     interrupted(tick, 3)
-    copy = [tick._state[i] for i in range(6)]
+    copy = [tick._state[i] for i in range(1, 8)]
     assert len(set(copy[:4])) > 1
 
 
 def test_a_snapshot_that_cannot_be_had_says_so(tick):
     ticks_at(tick, [5000])
     interrupted(tick, 10**6)
-    assert not tick.snapshot(array("i", [0] * 6))
+    assert not tick.snapshot(array("i", [0] * 7))
 
 
 def test_a_snapshot_taken_while_the_state_is_written_is_refused(tick):
     """Another core would see the sequence odd."""
     ticks_at(tick, [5000])
-    tick._sequence |= 1
-    assert not tick.snapshot(array("i", [0] * 6))
+    tick._state[0] |= 1
+    assert not tick.snapshot(array("i", [0] * 7))

@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from upright import __version__, runtimes
+from upright import __version__, bench, runtimes
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, rich_markup_mode="rich")
 console = Console()
@@ -62,6 +62,8 @@ def exec_file(
         raise typer.Exit(3) from None
     raise typer.Exit(subprocess.run(argv, env=environment).returncode)
 
+
+bench.register(app)
 
 _RUNTIME = "cpython, unix, unix32 or arm"
 
