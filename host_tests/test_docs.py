@@ -9,7 +9,9 @@ from chips.mpu6050 import MPU6050Chip
 from upright import cli, paths
 from world import StillWorld
 
-PAGES = sorted([paths.ROOT / "README.md", *paths.ROOT.glob("docs/*.md"), *paths.BOARDS.glob("*/*.md")])
+PAGES = sorted(
+    [paths.ROOT / "README.md", *paths.ROOT.glob("docs/*.md"), *paths.BOARDS.glob("*/*.md")]
+)
 
 
 def test_the_readmes_program_runs_and_shows_the_tilt():
