@@ -299,6 +299,14 @@ plans = st.lists(st.tuples(delays, st.sampled_from([0, 25, 300]), faults), max_s
 )
 @example([(75_000, 0, None)] * 12, 0, 8, True, 0)
 @example([(500, 25, ("brown", 30))] * 3, 0, 8, True, 0)
+# dies while its FIFO count is read, and again while it is asked whether it had
+@example(
+    [(0, 0, ("brown", 0)), (0, 0, None), (60_000, 0, None), (0, 0, ("brown", 0))],
+    0,
+    1,
+    False,
+    20_000,
+)
 @settings(max_examples=120, deadline=None)
 def test_no_misaligned_packet_whatever_happens_between_any_two_transactions(
     plan, byte_us, batch, health, restart_us

@@ -544,3 +544,14 @@ def test_nothing_in_the_tick_allocates(micropython_runtime, portable):
     assert len(lines) == 8
     assert sum(": ok 0 fresh" in line for line in lines) == 6
     assert sum(line.endswith("found") for line in lines) == 2
+
+
+def test_a_burst_that_nobody_drove_is_a_fault_and_no_sample():
+    """All ones: what the bus reads as when the chip dies after it was addressed."""
+    chip, imu = running()
+    tick(imu)
+    before = list(imu.counts[:10])
+    chip.stick(0x3A, 0xFF)
+    assert tick(imu) & 1 == 0
+    assert imu.errors == 1
+    assert list(imu.counts[:10]) == before

@@ -5,6 +5,7 @@
 import time
 from array import array
 
+import micropython
 from micropython import const
 from mpu_common import (  # noqa: F401  the health states are part of this module's face
     HEALTH_BUS_ERROR,
@@ -90,9 +91,11 @@ class MPU6050(MpuBase):
 
     # The bus, in the tick too: writeto of a prebuilt buffer, as writeto_mem allocates on several ports
 
+    @micropython.native
     def _read_into(self, register, buffer):
         self._i2c.readfrom_mem_into(self._address, register, buffer)
 
+    @micropython.native
     def _write(self, register, value):
         out = self._out
         out[0] = register

@@ -46,7 +46,9 @@ _NAMES = {
 
 _DATA_RDY = const(0x01)  # INT_STATUS and INT_ENABLE
 _FIFO_OFLOW = const(0x10)
+_NO_STATUS = const(0xA4)  # bits of INT_STATUS that no part of the family ever sets (RM 4.16)
 _FIFO_ENABLE = const(0x40)  # USER_CTRL.FIFO_EN
+_I2C_IF_DIS = const(0x10)  # USER_CTRL; clears itself on the 6500 (RM-6500 4.27)
 _FIFO_RESET = const(0x04)
 _FIFO_ALL = const(0xF8)  # FIFO_EN: TEMP, XG, YG, ZG, ACCEL
 _SLEEP = const(0x40)
@@ -378,8 +380,10 @@ class MpuBase:
         name = _NAMES.get(register, "register")
         raise self._error(f"bus error ({fault}) while {verb} {name} (0x{register:02x})")
 
-    # The tick: nothing below allocates, waits, raises or uses a float
+    # The tick: nothing below allocates, waits, raises or uses a float. Native where it is on the way of every
+    # sample: half the time of bytecode.
 
+    @micropython.native
     def read(self):
         """Fetch the newest sample into counts; returns its flags (bit 0: fresh).
 
@@ -387,11 +391,23 @@ class MpuBase:
         When there is none, or the bus fails, or the gyro has not settled after a repair, bit 0 is
         clear and the words keep what they held.
         """
+        raw = self._raw
         try:
-            self._read_into(_INT_STATUS, self._raw)
+            self._read_into(_INT_STATUS, raw)
         except OSError:
             return self._fault()
-        return self._sample(self._raw)
+        status = raw[0]
+        if status & _NO_STATUS:  # nobody drove the bus
+            return self._fault()
+        if status & _FIFO_OFLOW:
+            self._dirty = 1  # reading the flag has cleared it
+        if not status & _DATA_RDY:
+            self.stale = (self.stale + 1) & _COUNT_MASK
+            self._suspect = 1
+            return self._not_fresh()
+        if self._hold:
+            return self._withhold()
+        return unpack(raw, 1, self.counts)
 
     def temperature_cdeg(self):
         """Temperature of the newest sample in hundredths of a degC, by the formula of the part."""
@@ -419,6 +435,7 @@ class MpuBase:
             return 0
         return self._fifo_drain(level if level < self._batch_max else self._batch_max)
 
+    @micropython.native
     def fifo_next(self):
         """Put the next packet of the batch into counts, as read() does; returns its flags, 0 when
         there is none."""
@@ -428,8 +445,11 @@ class MpuBase:
         at = self._at
         self._at = at + _PACKET
         self._pending -= 1
-        return self._deliver(self._batch, at)
+        if self._hold:
+            return self._withhold()
+        return unpack(self._batch, at, self.counts)
 
+    @micropython.native
     def health(self):
         """Compare one configuration register with what was written to it; returns a HEALTH_ state.
 
@@ -475,16 +495,7 @@ class MpuBase:
     # Its parts. A bytecode frame over 11 words comes from the heap, and a `try` takes three of them:
     # hence so many small functions, and hardly a name beside a `try`.
 
-    def _sample(self, raw):
-        """What read() fetched: INT_STATUS and a sample."""
-        if raw[0] & _FIFO_OFLOW:
-            self._dirty = 1  # reading the flag has cleared it
-        if not raw[0] & _DATA_RDY:
-            self.stale = (self.stale + 1) & _COUNT_MASK
-            self._suspect = 1
-            return self._not_fresh()
-        return self._deliver(raw, 1)
-
+    @micropython.native
     def _compare(self, row):
         """Does a register still hold what the table says?"""
         try:
@@ -520,7 +531,12 @@ class MpuBase:
         except OSError:
             self._fault()
             return 0
-        return self._two[0] << 8 | self._two[1]
+        level = self._two[0] << 8 | self._two[1]
+        if level <= self.fifo_size:
+            return level
+        self._dirty = 1  # a chip that dies in the middle leaves the bus high: 0xffff
+        self._fault()
+        return 0
 
     def _fifo_drain(self, n):
         """Take n packets out, or none if they may not be whole ones."""
@@ -554,7 +570,8 @@ class MpuBase:
         except OSError:
             self._fault()
             return 0
-        if self._one[0] & _FIFO_ENABLE:
+        # the whole register: a chip that dies now leaves the bus high, 0xff
+        if (self._one[0] ^ (self._user_ctrl | _FIFO_ENABLE)) & ~_I2C_IF_DIS == 0:
             return 1
         self._suspect = 1
         return 0
@@ -572,14 +589,11 @@ class MpuBase:
         self._dirty = 0
         self.fifo_resets = (self.fifo_resets + 1) & _COUNT_MASK
 
-    def _deliver(self, raw, at):
-        """A new sample into counts, unless it is to be withheld."""
-        hold = self._hold
-        if hold:
-            if hold > 0:
-                self._hold = hold - 1
-            return self._not_fresh()
-        return unpack(raw, at, self.counts)
+    def _withhold(self):
+        """A sample that came before the gyro had settled: counted down, and not fresh."""
+        if self._hold > 0:
+            self._hold -= 1
+        return self._not_fresh()
 
     def _fault(self):
         self.errors = (self.errors + 1) & _COUNT_MASK

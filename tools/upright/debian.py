@@ -51,9 +51,11 @@ class Apt:
             text=True,
         ).stdout.split("\n")
         uris = [line.split(" ", 1)[1] for line in listed if line.startswith("main ")]
-        for uri in uris:
-            if re.search(r"/debian/?$", uri):
-                return uri
+        # a mirror of the distribution itself, not of its security updates or of a vendor's packages
+        for pattern in (r"/debian/?$", r"/debian/(?!.*security)"):
+            for uri in uris:
+                if re.search(pattern, uri):
+                    return uri
         raise AptError("no Debian mirror in the system's apt configuration")
 
     def run(self, *command: str, cwd: Path | None = None) -> str:

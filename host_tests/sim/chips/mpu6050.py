@@ -157,6 +157,11 @@ class MPU6050Chip:
         """Sampling: not asleep, and with a clock (CLKSEL 7 stops it, RM 4.28)."""
         return not self._registers[_PWR_MGMT_1] & 0x40 and self._registers[_PWR_MGMT_1] & 7 != 7
 
+    @property
+    def sample_us(self):
+        """When the newest sample was taken, absolute microseconds."""
+        return self._sample_us
+
     # Reset
 
     def _power_on_reset(self):
