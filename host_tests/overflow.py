@@ -1,8 +1,8 @@
 """Runs viper functions under CPython with every intermediate result held to 32 bits.
 
-`load` rewrites the syntax tree of a module: in each function decorated with @micropython.viper every arithmetic result,
-every shift count and every stored value goes through a check. What passes here cannot wrap on a
-32-bit board.
+`load` rewrites the syntax tree of a module: in each function decorated with @micropython.viper
+every arithmetic result, every shift count and every stored value goes through a check. What passes
+here cannot wrap on a 32-bit board.
 """
 
 import ast
@@ -11,9 +11,7 @@ import types
 from dataclasses import dataclass, field
 
 LOW, HIGH = -(1 << 31), (1 << 31) - 1
-SMALL = (
-    1 << 30
-)  # beyond +-SMALL an argument or result of a viper function is boxed on a 32-bit port
+SMALL = 1 << 30  # an argument or result beyond +- this is boxed on a 32-bit port
 
 
 class Overflow(AssertionError):

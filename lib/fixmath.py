@@ -33,7 +33,7 @@ PI_NUM = 3141592653589793
 PI_DEN = 1000000000000000
 
 
-# --------------------------------------------------------------------------------------------- tick
+# ------------------------------------------------------------------------------------------ tick
 @micropython.viper
 def tilt(s: ptr32, counts: ptr16):
     """Set E to (V / |V|) x UP, or to 0 where the accelerometer is not to be used.
@@ -208,37 +208,13 @@ def turn(s: ptr32):
     s[Q + 3] = q3 + h0 * zh + h1 * yh - h2 * xh + h3 * n + (r >> 15)
 
 
-# -------------------------------------------- main loop: allocates nothing, shares no memory with a
-# tick atan(2**-i) in degrees, Q20 fmt: off
-_ATAN = array(
-    "i",
-    [
-        47185920,
-        27855475,
-        14718068,
-        7471121,
-        3750058,
-        1876857,
-        938658,
-        469357,
-        234682,
-        117342,
-        58671,
-        29335,
-        14668,
-        7334,
-        3667,
-        1833,
-        917,
-        458,
-        229,
-        115,
-        57,
-        29,
-        14,
-        7,
-    ],
-)
+# ------------------------------------- main loop: allocates nothing, shares no memory with a tick
+# atan(2**-i) in degrees, Q20
+# fmt: off
+_ATAN = array("i", [
+    47185920, 27855475, 14718068, 7471121, 3750058, 1876857, 938658, 469357,
+    234682, 117342, 58671, 29335, 14668, 7334, 3667, 1833, 917, 458, 229, 115, 57, 29, 14, 7,
+])
 # fmt: on
 
 
@@ -356,8 +332,7 @@ def euler(q, out, order="zyx"):
         raise ValueError("order %r is not 'zyx' or 'zxy'" % (order,))
 
 
-# ------------------------------------------------------------------------------------------ set-up:
-# allocates
+# ----------------------------------------------------------------------------- set-up: allocates
 def isqrt(n):
     """The integer part of the square root of n >= 0, of any size."""
     if n < 2:
@@ -420,12 +395,14 @@ def unit_quaternion(w, x, y, z):
     if largest != largest or not 0 < largest < float("inf") or sum(parts) != sum(parts):
         raise ValueError("quaternion (%r, %r, %r, %r) has no direction" % parts)
     if not all([isinstance(v, int) for v in parts]):
-        scale = 1.0
-        while largest * scale < 1073741824.0:
-            scale *= 2
-        while largest * scale >= 2147483648.0:
-            scale /= 2
-        parts = [int(v * scale) for v in parts]
+        # into 30 bits; the numbers themselves are scaled, as the factor could leave the floats' range
+        while largest < 1073741824.0:
+            largest *= 2
+            parts = [v * 2 for v in parts]
+        while largest >= 2147483648.0:
+            largest /= 2
+            parts = [v / 2 for v in parts]
+        parts = [int(v) for v in parts]
     # a few bits to spare under the root
     norm = isqrt((parts[0] ** 2 + parts[1] ** 2 + parts[2] ** 2 + parts[3] ** 2) << 64)
     return tuple([ratio(v << 61, norm) for v in parts])

@@ -232,26 +232,38 @@ def _drive(s: ptr32, counts: ptr16):
             s[_O + i] = a - (s[_B + i] << k >> k)
             s[_OR + i] = ((n - (a << i_shift)) << 15 >> i_shift) - s[_BR + i]
             i += 1
+    # three times the same: a loop with computed indices costs a third more
     gain = s[_KP]
     shift = s[_KP_SHIFT]
     g = s[_G]
     g_rest = s[_GR]
-    i = 0
-    while i < 3:
-        e = s[_E + i] << k >> k
-        h = (e + 8192) >> 14
-        a = h * gain + (((e - (h << 14)) * gain + 8192) >> 14)
-        h = a >> shift
-        c = ((counts[3 + i] & 0xFFFF) ^ 0x8000) - 0x8000
-        r = ((a - (h << shift)) << 15 >> shift) + c * g_rest
-        r += s[_WR + i] + (s[_OR + i] << k >> k)
-        s[_WR + i] = r & 32767
-        s[_W + i] = h + c * g + (s[_O + i] << k >> k) + (r >> 15)
-        i += 1
+    e = s[_E] << k >> k
+    h = (e + 8192) >> 14
+    a = h * gain + (((e - (h << 14)) * gain + 8192) >> 14)
+    h = a >> shift
+    c = ((counts[3] & 0xFFFF) ^ 0x8000) - 0x8000
+    r = ((a - (h << shift)) << 15 >> shift) + c * g_rest + s[_WR] + (s[_OR] << k >> k)
+    s[_WR] = r & 32767
+    s[_W] = h + c * g + (s[_O] << k >> k) + (r >> 15)
+    e = s[_E + 1] << k >> k
+    h = (e + 8192) >> 14
+    a = h * gain + (((e - (h << 14)) * gain + 8192) >> 14)
+    h = a >> shift
+    c = ((counts[4] & 0xFFFF) ^ 0x8000) - 0x8000
+    r = ((a - (h << shift)) << 15 >> shift) + c * g_rest + s[_WR + 1] + (s[_OR + 1] << k >> k)
+    s[_WR + 1] = r & 32767
+    s[_W + 1] = h + c * g + (s[_O + 1] << k >> k) + (r >> 15)
+    e = s[_E + 2] << k >> k
+    h = (e + 8192) >> 14
+    a = h * gain + (((e - (h << 14)) * gain + 8192) >> 14)
+    h = a >> shift
+    c = ((counts[5] & 0xFFFF) ^ 0x8000) - 0x8000
+    r = ((a - (h << shift)) << 15 >> shift) + c * g_rest + s[_WR + 2] + (s[_OR + 2] << k >> k)
+    s[_WR + 2] = r & 32767
+    s[_W + 2] = h + c * g + (s[_O + 2] << k >> k) + (r >> 15)
 
 
-# ------------------------------------------------------------------------------------------ set-up:
-# allocates
+# ----------------------------------------------------------------------------- set-up: allocates
 def _ratio_of(value, name, unit_name):
     num, den = value if isinstance(value, (tuple, list)) else (value, 1)
     if not isinstance(num, int) or not isinstance(den, int) or num <= 0 or den <= 0:
