@@ -191,7 +191,7 @@ class Mahony6:
         """
         fixmath.euler(self._q, out, order)
 
-    @micropython.native
+    @micropython.viper
     def update(self, counts):
         """One step of 1/rate with the sample counts: array('h') of 11 words.
 
@@ -199,68 +199,66 @@ class Mahony6:
         gyro words go on) or bit 2 set (accelerometer at full scale), and below 1/16 g; the integral
         then stands still and goes on being applied.
         """
-        s = self._s
-        tilt(s, counts)
-        _drive(s, counts)
-        turn(s)
-
-
-@micropython.viper
-def _drive(s: ptr32, counts: ptr16):
-    """W = (gyro - bias + kp E + integral) dt/2, after the integral has taken up E."""
-    k = 0
-    if s[_PROBE] > 0:
-        k = 32
-    gain = s[_KI]
-    i = 0
-    if gain:
-        shift = s[_KI_SHIFT]
-        i_shift = s[_I_SHIFT]
-        i_max = s[_I_MAX]
-        while i < 3:
-            e = s[_E + i] << k >> k
-            h = (e + 8192) >> 14
-            a = h * gain + (((e - (h << 14)) * gain + 8192) >> 14) + s[_IR + i]
-            n = (s[_I + i] << k >> k) + (a >> shift)
-            s[_IR + i] = a - (a >> shift << shift)
-            if n > i_max:
-                n = i_max
-            elif n < 0 - i_max:
-                n = 0 - i_max
-            s[_I + i] = n
-            a = n >> i_shift
-            s[_O + i] = a - (s[_B + i] << k >> k)
-            s[_OR + i] = ((n - (a << i_shift)) << 15 >> i_shift) - s[_BR + i]
-            i += 1
-    # three times the same: a loop with computed indices costs a third more
-    gain = s[_KP]
-    shift = s[_KP_SHIFT]
-    g = s[_G]
-    g_rest = s[_GR]
-    e = s[_E] << k >> k
-    h = (e + 8192) >> 14
-    a = h * gain + (((e - (h << 14)) * gain + 8192) >> 14)
-    h = a >> shift
-    c = ((counts[3] & 0xFFFF) ^ 0x8000) - 0x8000
-    r = ((a - (h << shift)) << 15 >> shift) + c * g_rest + s[_WR] + (s[_OR] << k >> k)
-    s[_WR] = r & 32767
-    s[_W] = h + c * g + (s[_O] << k >> k) + (r >> 15)
-    e = s[_E + 1] << k >> k
-    h = (e + 8192) >> 14
-    a = h * gain + (((e - (h << 14)) * gain + 8192) >> 14)
-    h = a >> shift
-    c = ((counts[4] & 0xFFFF) ^ 0x8000) - 0x8000
-    r = ((a - (h << shift)) << 15 >> shift) + c * g_rest + s[_WR + 1] + (s[_OR + 1] << k >> k)
-    s[_WR + 1] = r & 32767
-    s[_W + 1] = h + c * g + (s[_O + 1] << k >> k) + (r >> 15)
-    e = s[_E + 2] << k >> k
-    h = (e + 8192) >> 14
-    a = h * gain + (((e - (h << 14)) * gain + 8192) >> 14)
-    h = a >> shift
-    c = ((counts[5] & 0xFFFF) ^ 0x8000) - 0x8000
-    r = ((a - (h << shift)) << 15 >> shift) + c * g_rest + s[_WR + 2] + (s[_OR + 2] << k >> k)
-    s[_WR + 2] = r & 32767
-    s[_W + 2] = h + c * g + (s[_O + 2] << k >> k) + (r >> 15)
+        state = self._s
+        tilt(state, counts)  # E
+        # W = (gyro - bias + kp E + integral) dt/2, after the integral has taken up E. This stands here and not in
+        # a kernel of its own: to call one costs as much as to do a third of its work.
+        s = ptr32(state)
+        c = ptr16(counts)
+        k = 0
+        if s[_PROBE] > 0:
+            k = 32
+        gain = s[_KI]
+        i = 0
+        if gain:
+            shift = s[_KI_SHIFT]
+            i_shift = s[_I_SHIFT]
+            i_max = s[_I_MAX]
+            while i < 3:
+                e = s[_E + i] << k >> k
+                h = (e + 8192) >> 14
+                a = h * gain + (((e - (h << 14)) * gain + 8192) >> 14) + s[_IR + i]
+                n = (s[_I + i] << k >> k) + (a >> shift)
+                s[_IR + i] = a - (a >> shift << shift)
+                if n > i_max:
+                    n = i_max
+                elif n < 0 - i_max:
+                    n = 0 - i_max
+                s[_I + i] = n
+                a = n >> i_shift
+                s[_O + i] = a - (s[_B + i] << k >> k)
+                s[_OR + i] = ((n - (a << i_shift)) << 15 >> i_shift) - s[_BR + i]
+                i += 1
+        # three times the same: a loop with computed indices costs a third more
+        gain = s[_KP]
+        shift = s[_KP_SHIFT]
+        g = s[_G]
+        g_rest = s[_GR]
+        e = s[_E] << k >> k
+        h = (e + 8192) >> 14
+        a = h * gain + (((e - (h << 14)) * gain + 8192) >> 14)
+        h = a >> shift
+        n = ((c[3] & 0xFFFF) ^ 0x8000) - 0x8000
+        r = ((a - (h << shift)) << 15 >> shift) + n * g_rest + s[_WR] + (s[_OR] << k >> k)
+        s[_WR] = r & 32767
+        s[_W] = h + n * g + (s[_O] << k >> k) + (r >> 15)
+        e = s[_E + 1] << k >> k
+        h = (e + 8192) >> 14
+        a = h * gain + (((e - (h << 14)) * gain + 8192) >> 14)
+        h = a >> shift
+        n = ((c[4] & 0xFFFF) ^ 0x8000) - 0x8000
+        r = ((a - (h << shift)) << 15 >> shift) + n * g_rest + s[_WR + 1] + (s[_OR + 1] << k >> k)
+        s[_WR + 1] = r & 32767
+        s[_W + 1] = h + n * g + (s[_O + 1] << k >> k) + (r >> 15)
+        e = s[_E + 2] << k >> k
+        h = (e + 8192) >> 14
+        a = h * gain + (((e - (h << 14)) * gain + 8192) >> 14)
+        h = a >> shift
+        n = ((c[5] & 0xFFFF) ^ 0x8000) - 0x8000
+        r = ((a - (h << shift)) << 15 >> shift) + n * g_rest + s[_WR + 2] + (s[_OR + 2] << k >> k)
+        s[_WR + 2] = r & 32767
+        s[_W + 2] = h + n * g + (s[_O + 2] << k >> k) + (r >> 15)
+        turn(state)
 
 
 # ----------------------------------------------------------------------------- set-up: allocates

@@ -311,7 +311,7 @@ def remarks(figures: Figures) -> Iterator[str]:
     if of:
         yield (
             f"arm: the integer filter takes {of[_FLOAT] / of['filter']:.1f} times fewer instructions than the float"
-            f" one (required: {LEAST_RATIO}); {of['float'] / of['filter']:.1f} times fewer if its garbage were never"
+            f" one ({LEAST_RATIO} are asked for); {of['float'] / of['filter']:.1f} times fewer if its garbage were never"
             " collected"
         )
     of = figures.microseconds
