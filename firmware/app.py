@@ -25,6 +25,7 @@ _REST_ACCEL_MG = const(120)
 _BIAS_MOST_DPS = const(20)
 _REST_WINDOW_MS = const(1000)
 _REST_TRIES = const(4)
+_REST_READS_HZ = const(200)  # at least, with the slowest bus
 
 
 class App:
@@ -59,7 +60,10 @@ class App:
     def run(self):
         try:
             self.start()
-        except ValueError as why:  # a setting that cannot be had: board.py has to change
+        except (
+            ValueError,
+            TypeError,
+        ) as why:  # a setting that cannot be had: board.py has to change
             self.say("Wrong setting", str(why))
             raise
         while True:
@@ -131,6 +135,9 @@ class App:
         gyro_most = _REST_GYRO_DPS * num // den
         bias_most = _BIAS_MOST_DPS * num // den
         accel_most = imu.accel_lsb_per_g * _REST_ACCEL_MG // 1000
+        rate_num, rate_den = self.config.RATE if self.config.EXTERNAL_CLOCK else imu.sample_rate
+        # half of what the chip and this loop can give
+        enough = min(rate_num // rate_den, _REST_READS_HZ) * _REST_WINDOW_MS // 2000
         for _ in range(_REST_TRIES):
             low = array("h", [32767] * 6)
             high = array("h", [-32768] * 6)
@@ -146,7 +153,7 @@ class App:
                         low[i] = min(low[i], c)
                         high[i] = max(high[i], c)
                 time.sleep_ms(2)
-            if n < 50:
+            if n < enough:
                 print("bias: only %d samples in %d ms" % (n, _REST_WINDOW_MS))
                 continue
             spread = [high[i] - low[i] for i in range(6)]

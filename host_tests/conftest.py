@@ -1,7 +1,10 @@
 """What every test shares: the board's search path under CPython, a fresh simulated machine, and the runtimes."""
 
+import os
 import sys
 from pathlib import Path
+
+import hypothesis
 
 ROOT = Path(__file__).resolve().parents[1]
 for folder in ("boards/sim", "firmware", "lib", "host_tests", "host_tests/sim", "host_tests/shim"):
@@ -9,9 +12,24 @@ for folder in ("boards/sim", "firmware", "lib", "host_tests", "host_tests/sim", 
 
 import micropython  # noqa: E402, F401  (the shim: it prepares `time` before anything of lib/ is imported)
 import pytest  # noqa: E402
-from upright import runtimes  # noqa: E402
+from upright import runtimes, trials  # noqa: E402
 
 PORTABLE = Path(__file__).parent / "portable"
+
+# No test is a matter of time. The same examples every time, so that a red run means that something changed;
+# EXPLORE=1 looks for new ones.
+hypothesis.settings.register_profile(
+    "upright", deadline=None, derandomize=not os.environ.get("EXPLORE")
+)
+hypothesis.settings.load_profile("upright")
+
+
+def pytest_generate_tests(metafunc):
+    """`recorded`: each recorded trial in turn, as a path; one skip, in one clear line, where there are none."""
+    if "recorded" in metafunc.fixturenames:
+        files = [pytest.param(path, id=path.stem) for path in trials.trial_files()]
+        none = pytest.param(None, id="none", marks=pytest.mark.skip(reason=trials.NO_DATA))
+        metafunc.parametrize("recorded", files or [none])
 
 
 @pytest.fixture(autouse=True)

@@ -244,9 +244,9 @@ def test_a_stuck_bus_costs_time_not_the_program(boot):
         seconds=6, faults=[[3 * SECOND, "bus", "stuck", True], [4 * SECOND, "bus", "stuck", False]]
     )
     healthy(result)
-    assert result["errors"] > 5
-    assert result["missed"] > 50
-    assert result["fresh"] > 500
+    assert result["errors"] > 100
+    assert 0 < result["missed"] < 100  # a transfer is given up after 3 ms, so most ticks still come
+    assert result["fresh"] > 700
 
 
 def test_a_board_that_never_rests_goes_on_flagged(boot, tmp_path):
@@ -258,6 +258,13 @@ def test_a_board_that_never_rests_goes_on_flagged(boot, tmp_path):
     healthy(result)
     assert not result["bias_known"]
     assert any("never at rest" in line for line in lines)
+
+
+def test_a_slow_chip_gives_enough_samples_for_its_bias(boot):
+    result, *_ = boot(seconds=5, board={"RATE": 50, "SENSOR_RATE_HZ": 50, "DRIVE": "data_ready"})
+    healthy(result)
+    assert result["bias_known"]
+    assert result["missed"] == 0
 
 
 def test_a_setting_with_a_slip_of_the_pen_is_refused(boot):

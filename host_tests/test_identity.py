@@ -88,25 +88,17 @@ def test_other_gains_give_other_bits(rendered, tmp_path):
     assert (one != other).any()
 
 
-def recorded():
-    if trials.find_data() is None:
-        return [pytest.param(None, marks=pytest.mark.skip(reason=trials.NO_DATA))]
-    return [pytest.param(path, id=path.stem) for path in trials.trial_files()]
-
-
-@pytest.mark.parametrize("path", recorded())
-def test_recorded_trials_replay_the_same_through_the_chip_and_past_it(path):
-    trial = trials.load(path)
+def test_recorded_trials_replay_the_same_through_the_chip_and_past_it(recorded):
+    trial = trials.load(recorded)
     runtime = simulate.best_runtime()
     through = replay.replay(trial, runtime=runtime, seconds=20)
     straight = replay.replay(trial, runtime=runtime, seconds=20, direct=True)
     assert (through.q29 == straight.q29).all()
 
 
-@pytest.mark.parametrize("path", recorded())
-def test_recorded_trials_are_followed_as_well_as_this_filter_can(path):
+def test_recorded_trials_are_followed_as_well_as_this_filter_can(recorded):
     """Loose bounds: a filter that is broken is tens of degrees off; how good it is stands in the docs."""
-    trial = trials.load(path)
+    trial = trials.load(recorded)
     if not trial.has_truth:
         pytest.skip(f"{trial.name} has no truth")
     done = replay.replay(trial, runtime=simulate.best_runtime(), direct=True)

@@ -122,18 +122,8 @@ def test_the_series_converges_to_the_closed_form_order_by_order(history):
     assert errors[3] < errors[2] < 1e-3
 
 
-def trial_files():
-    try:
-        return trials.trial_files()
-    except trials.TrialError:
-        return []
-
-
-@pytest.mark.parametrize("path", trial_files() or [None], ids=lambda p: p.stem if p else "none")
-def test_within_a_hundredth_of_a_degree_of_the_float_twin_on_a_recorded_trial(history, path):
-    if path is None:
-        pytest.skip("no recorded trials: UPRIGHT_DATA or ../shared/data")
-    trial = trials.load(path)
+def test_within_a_hundredth_of_a_degree_of_the_float_twin_on_a_recorded_trial(history, recorded):
+    trial = trials.load(recorded)
     bias = None
     if "gyro_bias_rest_dps" in trial.header:
         scale = trial.gyro_scale[0] / trial.gyro_scale[1] * 256

@@ -63,6 +63,7 @@ def test_a_dead_mirror_is_said_and_leaves_nothing_behind(monkeypatch, fresh, tmp
     monkeypatch.setenv("UPRIGHT_CACHE", str(tmp_path))
     nowhere = tmp_path / "no-such-mirror"
     monkeypatch.setattr(debian.Apt, "_mirror", staticmethod(lambda: f"file:{nowhere}"))
+    (tmp_path / "runtimes" / ".unpacking-killed").mkdir(parents=True)  # what a killed run leaves
     with pytest.raises(runtimes.Unavailable) as why:
         runtimes.interpreter("arm")
     assert "apt-get" in str(why.value)

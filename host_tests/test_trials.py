@@ -315,21 +315,20 @@ def test_without_upright_data_the_folder_beside_the_project_serves(tmp_path, mon
     assert trials.find_data() == beside.resolve()
 
 
-def test_every_recorded_trial_loads_and_its_truth_scores_perfectly_against_itself(tmp_path):
-    if not trials.trial_files():
-        pytest.skip(trials.NO_DATA)
-    for path in trials.trial_files():
-        t = trials.load(path)
-        assert t.has_truth and t.n > 1000
-        # gravity as the truth has it is what the accelerometer shows on average
-        q = t.q_true()[t.movement & np.isfinite(t.q_gt[:, 0])]
-        acc = t.counts[:: t.gt_every, :3][t.movement & np.isfinite(t.q_gt[:, 0])]
-        up = motions.multiply(
-            motions.multiply(q, np.insert(acc.astype(float), 0, 0, 1)), q * [1, -1, -1, -1]
-        )[:, 1:].mean(0)
-        assert up[2] / t.accel_lsb_per_g == pytest.approx(1, abs=0.05)
-        assert np.abs(up[:2] / t.accel_lsb_per_g).max() < 0.05
-        every = scoring.score(t.t_gt, np.where(np.isnan(t.q_gt), 1, t.q_true()), t.t_gt, t.q_true())
-        assert max(every.inclination, every.heading, every.total) < 1e-5 and every.coverage == 1
-        rows = t.write(tmp_path / "t.imu", seconds=1)
-        assert list(world.World(tmp_path / "t.imu").row(rows - 1)) == list(t.counts[rows - 1])
+def test_every_recorded_trial_loads_and_its_truth_scores_perfectly_against_itself(
+    tmp_path, recorded
+):
+    t = trials.load(recorded)
+    assert t.has_truth and t.n > 1000
+    # gravity as the truth has it is what the accelerometer shows on average
+    q = t.q_true()[t.movement & np.isfinite(t.q_gt[:, 0])]
+    acc = t.counts[:: t.gt_every, :3][t.movement & np.isfinite(t.q_gt[:, 0])]
+    up = motions.multiply(
+        motions.multiply(q, np.insert(acc.astype(float), 0, 0, 1)), q * [1, -1, -1, -1]
+    )[:, 1:].mean(0)
+    assert up[2] / t.accel_lsb_per_g == pytest.approx(1, abs=0.05)
+    assert np.abs(up[:2] / t.accel_lsb_per_g).max() < 0.05
+    every = scoring.score(t.t_gt, np.where(np.isnan(t.q_gt), 1, t.q_true()), t.t_gt, t.q_true())
+    assert max(every.inclination, every.heading, every.total) < 1e-5 and every.coverage == 1
+    rows = t.write(tmp_path / "t.imu", seconds=1)
+    assert list(world.World(tmp_path / "t.imu").row(rows - 1)) == list(t.counts[rows - 1])

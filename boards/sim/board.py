@@ -10,7 +10,7 @@ NAME = "simulated board"
 SENSOR_RATE_HZ = 1000
 DISPLAY_SHARES_BUS = True
 
-_i2c = I2C(0, scl=Pin(5), sda=Pin(4), freq=400000)
+_i2c = I2C(0, scl=Pin(5), sda=Pin(4), freq=400000, timeout=3000)
 
 
 def sensor():

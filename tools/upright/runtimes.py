@@ -102,6 +102,8 @@ def _obtain(names: list[str]) -> dict[str, str]:
             return failed
         place = paths.cache() / "runtimes"
         place.mkdir(exist_ok=True)
+        for left in place.glob(".unpacking-*"):  # by a run that was killed
+            shutil.rmtree(left, ignore_errors=True)
         columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn())
         with (
             Progress(*columns, console=console) as progress,
