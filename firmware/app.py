@@ -180,6 +180,8 @@ class App:
     def _start_tick(self, rate):
         board = self.board
         num, den = rate
+        self.rate_hz = (2 * num + den) // (2 * den)  # until the first second has been counted
+        self._rate_at = time.ticks_ms()
         self._period_us = (2000000 * den + num) // (2 * num)
         display = self.display if self.config.DISPLAY_SHARES_BUS else None
         fifo = self.config.DRIVE == "fifo"

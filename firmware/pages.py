@@ -231,18 +231,20 @@ class Pages:
     # -------------------------------------------------------------------------- messages
 
     def message(self, title, *lines):
-        """A title and lines below it, wrapped at words. Allocates: not for the running loop."""
+        """A title and lines below it, wrapped at words, as far as they fit. Allocates: not for the running loop."""
         d = self._display
         across = d.width // 6
-        step = 8 if self._low else 10
-        y = step + (0 if self._low else 3)
+        parts = []
+        for line in lines:
+            parts += wrap(line, across)
+        y = 8 if self._low else 13
+        step = 8 if self._low or y + 10 * len(parts) > d.height else 10
         d.fill(BLACK)
         d.fill_rect(0, 0, d.width, 8 if self._low else 10, WHITE)
         d.text(title[:across], 1, 0 if self._low else 1, SMALL, INVERSE)
-        for line in lines:
-            for part in wrap(line, across):
-                d.text(part, 1, y)
-                y += step
+        for part in parts[: (d.height - y + 1) // step]:
+            d.text(part, 1, y)
+            y += step
 
 
 def wrap(text, across):

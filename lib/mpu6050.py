@@ -160,14 +160,13 @@ class MPU6050(MpuBase):
         return self._one[0]
 
     def _absent(self):
-        text = f"no MPU6050 at 0x{self._address:02x}: WHO_AM_I read 11 times in 0.1 s, no answer; "
         other = 0x69 if self._address == 0x68 else 0x68
         who = self._who_is_at(other)
         if who is None:
-            return text + f"none at 0x{other:02x} either. Check supply, SDA, SCL and their pull-ups"
-        return text + (
-            f"0x{other:02x} answers, with 0x{who:02x}. AD0 sets the address: low 0x68, high 0x69"
-        )
+            hint = f"none at 0x{other:02x} either. Check supply, SDA, SCL and their pull-ups"
+        else:
+            hint = f"0x{other:02x} answers, with 0x{who:02x}. AD0 sets the address: low 0x68, high 0x69"
+        return f"no MPU6050 at 0x{self._address:02x}; {hint} (WHO_AM_I: no answer to 11 reads in 0.1 s)"
 
     def self_test(self):
         """Compare how the chip reacts to its self-test actuators with the factory trims.
