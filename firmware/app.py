@@ -60,10 +60,8 @@ class App:
     def run(self):
         try:
             self.start()
-        except (
-            ValueError,
-            TypeError,
-        ) as why:  # a setting that cannot be had: board.py has to change
+        except (ValueError, TypeError) as why:
+            # a setting that cannot be had: board.py has to change
             self.say("Wrong setting", str(why))
             raise
         while True:
@@ -80,9 +78,8 @@ class App:
         imu = self.imu
         rate = self.config.RATE
         if self.config.DRIVE != "timer" and not self.config.EXTERNAL_CLOCK:
-            rate = (
-                imu.sample_rate
-            )  # every packet or data-ready edge is one step, so the chip's rate is the rate
+            # every packet or data-ready edge is one step, so the chip's rate is the rate
+            rate = imu.sample_rate
         self.filter = filters.make(self.config.FILTER, rate, imu, self.config.GAINS)
         if self.config.MEASURE_BIAS:
             self.say("Keep still", "measuring the", "gyro's bias")
@@ -102,9 +99,8 @@ class App:
             if self.display is not None:
                 self._pages = pages.Pages(self.display)
                 self.display.begin()
-        except (
-            OSError
-        ) as why:  # the attitude is worth having without a display; it may still appear
+        except OSError as why:
+            # the attitude is worth having without a display; it may still appear
             print("display:", why)
 
     def _open_sensor(self):

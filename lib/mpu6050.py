@@ -113,9 +113,8 @@ class MPU6050(MpuBase):
                 self._write(_PWR_MGMT_1, _DEVICE_RESET)
                 break
             except OSError:
-                time.sleep_ms(
-                    1
-                )  # perhaps the chip let go of the bus as it reset: once more is safe
+                # perhaps the chip let go of the bus as it reset: once more is safe
+                time.sleep_ms(1)
         time.sleep_ms(100)  # what the register map asks for after DEVICE_RESET
         for _ in range(10):
             try:

@@ -525,9 +525,8 @@ class MpuBase:
 
     def _fifo_bytes(self):
         try:
-            self._read_into(
-                _FIFO_COUNTH, self._two
-            )  # high byte first: it latches the low (RM 4.30)
+            # high byte first: it latches the low (RM 4.30)
+            self._read_into(_FIFO_COUNTH, self._two)
         except OSError:
             self._fault()
             return 0
