@@ -74,7 +74,7 @@ class App:
         self._open_display()
         self.say("Upright", board.NAME, "looking for", "the sensor")
         while not self._open_sensor():
-            self._wait(_RETRY_MS)
+            time.sleep_ms(_RETRY_MS)
         imu = self.imu
         rate = self.config.RATE
         if self.config.DRIVE != "timer" and not self.config.EXTERNAL_CLOCK:
@@ -279,9 +279,6 @@ class App:
     def _flush(self):
         while self.display.busy:
             self.display.flush_step(self.config.DISPLAY_CHUNK)
-
-    def _wait(self, ms):
-        time.sleep_ms(ms)
 
 
 class _DataReady:

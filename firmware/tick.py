@@ -103,9 +103,8 @@ class Tick:
                 self._step()
                 if self._display is not None:
                     self._display.flush_step(self._chunk)
-        except (
-            Exception
-        ) as error:  # it must not stop the timer: counted, and shown by the main program
+        except Exception as error:
+            # it must not stop the timer: counted, and shown by the main program
             self._crashed(error)
         self._inside = False
 

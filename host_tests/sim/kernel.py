@@ -210,11 +210,6 @@ def mask(on):
     return before
 
 
-def schedule(function, argument):
-    """micropython.schedule's queue, for the mock's own use."""
-    Irq(function, argument, False).request()
-
-
 def _run_hard():
     global _in_irq, _locked, irq_count
     while _hard:

@@ -48,9 +48,9 @@ class _Clock:
 
     def __init__(self, unit_ns):
         self.unit_ns = unit_ns
-        self.reset(0)
+        self.reset()
 
-    def reset(self, units):
+    def reset(self):
         self.start = kernel.now()
         self.units = 0
         self.quiet_until = kernel.next_due()
@@ -135,7 +135,7 @@ class SoftI2C:
         bus.begin()
         try:
             clock = self._clock
-            clock.reset(0)
+            clock.reset()
             if bus.stuck:
                 kernel.advance(self._timeout)
                 raise OSError(ETIMEDOUT)
@@ -247,7 +247,7 @@ class SoftSPI:
         bus.begin()
         try:
             clock = self._clock
-            clock.reset(0)
+            clock.reset()
             mode = self._polarity << 1 | self._phase
             for i in range(len(out)):
                 at = clock.step(8)
