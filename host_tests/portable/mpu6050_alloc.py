@@ -88,7 +88,7 @@ class Ticks:
     def fifo(self, i):
         self.bus.status = 0x11 if i % 10 == 3 else i % 10 != 5
         self.bus.fail = self.faults and i % 10 == 7
-        self.bus.level = (i & 7) * 14 + (i & 3)
+        self.bus.level = (i & 7) * 14 + (1 if i % 5 == 4 else 0)
         for _ in range(self.imu.fifo_poll()):
             self.fresh += self.imu.fifo_next() & 1
 
@@ -104,8 +104,8 @@ class Ticks:
     # Twins that must be found out
 
     def keeps_a_bound_method(self, i):
-        read = self.imu.read
-        read()
+        method = self.imu.temperature_cdeg
+        method()
 
     def has_a_large_frame(self, i):
         a = b = c = d = e = f = g = h = k = m = n = o = p = i

@@ -5,20 +5,25 @@
 
 from micropython import const
 
-_SELF_TEST_X = const(0x0D)
+from chips.aux_master import AuxMaster
+from chips.common import PacketFifo
+from chips.mpu_sensors import GYRO_START_US, Sensors
+
 _SMPLRT_DIV = const(0x19)
 _CONFIG = const(0x1A)
-_GYRO_CONFIG = const(0x1B)
-_ACCEL_CONFIG = const(0x1C)
 _FIFO_EN = const(0x23)
+_I2C_MST_CTRL = const(0x24)
+_SLV4_CTRL = const(0x34)
+_SLV4_DI = const(0x35)
+_I2C_MST_STATUS = const(0x36)
 _INT_PIN_CFG = const(0x37)
 _INT_ENABLE = const(0x38)
 _INT_STATUS = const(0x3A)
 _ACCEL_XOUT_H = const(0x3B)
+_MST_DELAY_CTRL = const(0x67)
 _SIGNAL_PATH_RESET = const(0x68)
 _USER_CTRL = const(0x6A)
 _PWR_MGMT_1 = const(0x6B)
-_PWR_MGMT_2 = const(0x6C)
 _MEM_R_W = const(0x6F)
 _FIFO_COUNTH = const(0x72)
 _FIFO_COUNTL = const(0x73)
@@ -28,16 +33,8 @@ _WHO_AM_I = const(0x75)
 _DATA_RDY = const(0x01)
 _FIFO_OFLOW = const(0x10)
 
-# LSB per deg/s as a ratio, RM 4.19; LSB per g, RM 4.17
-_GYRO_SCALES = ((131, 1), (131, 2), (164, 5), (82, 5))
-_ACCEL_LSB = (16384, 8192, 4096, 2048)
-
 _PULSE_US = const(50)  # RM 4.14, LATCH_INT_EN = 0
-_GYRO_START_US = const(30_000)  # PS 6.1, zero-rate output within 1 deg/s of its final value
-_GYRO_START_DPS = const(20)  # PS 6.1, initial zero-rate output tolerance
-# Where in a world's row (ax ay az gx gy gz mx my mz temp) the words of 0x3B..0x48 stand
-_ORDER = (0, 1, 2, 9, 3, 4, 5)
-# FIFO_EN bit of each of those words (RM 4.6); packets are in register order all the same (RM 4.31)
+# FIFO_EN bit of each of the words of 0x3B..0x48 (RM 4.6); packets are in register order all the same (RM 4.31)
 _FIFO_BITS = (0x08, 0x08, 0x08, 0x80, 0x40, 0x20, 0x10)
 
 
@@ -47,110 +44,64 @@ def _gcd(a, b):
     return a
 
 
-def _scaled(value, num, den):
-    """value * num / den, rounded half up and saturated like the chip's 16-bit output."""
-    value = (2 * value * num + den) // (2 * den)
-    return -32768 if value < -32768 else 32767 if value > 32767 else value
-
-
-class MPU6050Chip:
+class MPU6050Chip(Sensors):
     """One chip on an I2C bus.
 
     world           what it measures: rows of counts, see world.py
     address         7 bits
     who_am_i        its identity; anything but 0x68 behaves as one of the MPU6500 family: awake after
                     reset, a FIFO of 512 bytes, another temperature scale
-    trims           factory self-test codes of accel x y z and gyro x y z, 0..31 (RM 4.1)
+    trims           factory self-test codes of accel x y z and gyro x y z, 0..31 (RM 4.1); of the
+                    MPU6500 family 0..255 (RM-MPU-6500A 4.1, 4.2); None: some
     clock_ppm       error of the clock when the gyro PLL drives it (PS 7.15: within 1 %)
     oscillator_ppm  the same for the internal oscillator, which runs after reset
     fifo_byte_us    time between two bytes of a packet on its way into the FIFO; 0: all at once
 
+    Its attributes: aux, the list of chip models on its auxiliary bus; master, the AuxMaster that
+    speaks with them; misuse and log, see Faults.
+
     The digital low-pass filter sets rates only: it does not filter what the world gives. Not
-    simulated: the auxiliary bus, cycle mode, motion interrupts, the DMP, FSYNC, offset registers.
+    simulated: I2C bypass, cycle mode, motion interrupts, the DMP, FSYNC, offset registers.
     """
 
-    # The datasheets say only what a driver must allow, 100 ms; these are less, to be changed at will
+    # The datasheets say only what a driver must allow, 100 ms; this is less, to be changed at will
     reset_us = 20_000  # after DEVICE_RESET: writes are ignored, bit 7 of PWR_MGMT_1 reads 1
-    power_up_us = 20_000  # after power-up: no answer
+    _rate_registers = (_SMPLRT_DIV, _CONFIG)
 
     def __init__(
         self,
         world,
         address=0x68,
         who_am_i=0x68,
-        trims=(16, 14, 18, 15, 17, 13),
+        trims=None,
         clock_ppm=0,
         oscillator_ppm=20_000,
         fifo_byte_us=0,
         now=0,
     ):
+        self._init_faults(now)
         self.world = world
         self.address = address
         self.family_6500 = who_am_i != 0x68
-        self.fifo_size = 512 if self.family_6500 else 1024
-        self.fifo_byte_us = fifo_byte_us
-        self.trims = trims
+        self.fifo = PacketFifo(512 if self.family_6500 else 1024, fifo_byte_us)
+        self.trims = trims or self._some_trims()
         self.broken = ()  # axes (0..5: accel x y z, gyro x y z) that do not react to self-test
-        self.misuse = []  # what a driver did that the register map forbids
-        self.log = None  # a list here receives (now, register, value) of every write
         self.int_level = 0
+        self.master = AuxMaster(self)
+        self.aux = self.master.slaves
         self._identity = who_am_i
         self._ppm = (oscillator_ppm, clock_ppm)
-        self._stuck = {}
-        self._nack_skip = 0
-        self._nacks = 0
-        self._gone = False
-        self._dead_until = 0
         self._reset_until = 0
-        self._now = now
         self._busy = False
         self._pointer = 0
         self._pointing = False
-        self._plain = False
         self._power_on_reset()
 
-    # Faults and observation, for tests
-
-    def nack_next(self, n=1, after=0):
-        """Let `after` acknowledges (of address and written bytes) pass, then refuse n."""
-        self._nack_skip = after
-        self._nacks = n
-
-    def vanish(self):
-        """A broken wire: nothing is acknowledged and the clock runs on unseen."""
-        self._gone = True
-        self._plain = False
-
-    def come_back(self):
-        self._gone = False
-
-    def brown_out(self, now=None):
-        """The supply dips: power-on reset in flight, then silence for power_up_us."""
-        self.poll(self._now if now is None else now)
-        self._power_on_reset()
-        self._dead_until = self._now + self.power_up_us
-        self._plain = False
-
-    def stick(self, register, value=None):
-        """Reading the register always gives value; None mends it."""
-        self._plain = False
-        if value is None:
-            self._stuck.pop(register, None)
-        else:
-            self._stuck[register] = value
-
-    def register(self, register):
-        """What is in a register, without the side effects of reading it over the bus."""
-        return self._registers[register]
-
-    def poke(self, register, value):
-        """Change a register behind the driver's back."""
-        self.poll(self._now)
-        self._set(register, value)
+    # Observation, for tests; faults are in Faults
 
     @property
     def fifo_count(self):
-        return self._fifo_count
+        return self.fifo.count
 
     @property
     def awake(self):
@@ -169,13 +120,7 @@ class MPU6050Chip:
         self._registers = bytearray(128)
         self._registers[_PWR_MGMT_1] = 0x01 if self.family_6500 else 0x40
         self._registers[_WHO_AM_I] = self._identity
-        ax, ay, az, gx, gy, gz = self.trims
-        if not self.family_6500:
-            at = _SELF_TEST_X
-            self._registers[at] = (ax >> 2) << 5 | gx
-            self._registers[at + 1] = (ay >> 2) << 5 | gy
-            self._registers[at + 2] = (az >> 2) << 5 | gz
-            self._registers[at + 3] = (ax & 3) << 4 | (ay & 3) << 2 | (az & 3)
+        self._factory_values()
         self._words = [0] * 7
         self._shown = None  # the words that the registers 0x3B..0x48 hold
         self._latched = True
@@ -183,24 +128,19 @@ class MPU6050Chip:
         self._status = 0
         self._pulse_end = 0
         self._i2c_disabled = False
-        self._fifo = bytearray(self.fifo_size)
-        self._fifo_last = 0
-        self._fifo_clear()
+        self.fifo.clear()
+        self.master.stop(self._now, None)
+        self.master.reset()
         self._restart_clock()
-        self._wake_us = self._now - (0 if self.awake else _GYRO_START_US)
+        self._wake_us = self._now - (0 if self.awake else GYRO_START_US)
         self._drive_int()
 
     # The sample clock
 
     def _restart_clock(self):
         """Sampling starts anew now: at reset, on waking, and when the rate changes."""
-        r = self._registers
-        dlpf = r[_CONFIG] & 7
-        fast = dlpf in (0, 7)  # RM 4.2: gyro output rate 8 kHz without the filter, else 1 kHz
-        rate = 8000 if fast else 1000
-        # RM-MPU-6500A 4.4: there the divider works with the filter only
-        divider = 1 if self.family_6500 and fast else 1 + r[_SMPLRT_DIV]
-        ppm = self._ppm[1 if r[_PWR_MGMT_1] & 7 else 0]
+        rate, divider = self._rate()
+        ppm = self._ppm[1 if self._registers[_PWR_MGMT_1] & 7 else 0]
         num, den = divider * 1_000_000_000_000, rate * (1_000_000 + ppm)
         g = _gcd(num, den)
         self._period = (num // g, den // g)
@@ -211,8 +151,20 @@ class MPU6050Chip:
         if self._driven():
             self._done = self._count(self._now)
         self._next_us = self._time(self._done + 1)
-        self._half_packet = None
+        self.fifo.packet = None
         self._quiet_until = 0
+
+    def _rate(self):
+        """Gyro output rate in Hz and what it is divided by (RM 4.2)."""
+        r = self._registers
+        fast = r[_CONFIG] & 7 in (0, 7)  # 8 kHz without the filter, else 1 kHz
+        # RM-MPU-6500A 4.4: there the divider works with the filter only
+        divider = 1 if self.family_6500 and fast else 1 + r[_SMPLRT_DIV]
+        return 8000 if fast else 1000, divider
+
+    def _accel_us(self):
+        """RM 4.2: the accelerometer's output rate is 1 kHz, faster samples repeat it."""
+        return 1000
 
     def _driven(self):
         """True when a recorded trial sets the times of the samples: its row k is chip sample k."""
@@ -251,50 +203,90 @@ class MPU6050Chip:
                 self._next_us = self._time(1)
         running = self.awake and now >= self._reset_until and now >= self._dead_until
         if running:
-            if self._half_packet is not None:
+            if self.fifo.packet is not None:
                 self._push_packet()
             if self._next_us is not None and now >= self._next_us:
                 self._new_samples(self._count(now))
                 self._next_us = self._time(self._done + 1)
+        master = self.master
+        if master.next_us is not None:
+            master.advance(now)
         self._drive_int()
         # until when nothing happens of its own accord: most accesses need no more than this
         quiet = now + 1_000_000
-        if self._half_packet is not None or (self.awake and not running):
+        if self.fifo.packet is not None or (self.awake and not running):
             quiet = now
         elif running and self._next_us is not None:
             quiet = min(quiet, self._next_us)
+        if master.next_us is not None:
+            quiet = min(quiet, master.next_us)
         if now < self._pulse_end:
             quiet = min(quiet, self._pulse_end)
         self._quiet_until = quiet
 
     def _new_samples(self, total):
         r = self._registers
-        first = self._done + 1
-        if r[_USER_CTRL] & 0x40 and r[_FIFO_EN] & 0xF8:
-            packet = 0
-            for bit in _FIFO_BITS:
-                packet += 2 if r[_FIFO_EN] & bit else 0
-            # of a long gap only what still fits is worth computing; what it would have pushed out
-            # has overflowed
-            fit = self.fifo_size // packet + 2
-            skipped = total - self._done - fit
-            if skipped > 0 and not self._fifo_stops():
-                first += skipped
-                self._fifo_skip(skipped * packet)
-            for k in range(first, total + 1):
+        master = self.master
+        fifo_on = r[_USER_CTRL] & 0x40 and (r[_FIFO_EN] or r[_I2C_MST_CTRL] & 0x20)
+        if fifo_on or master.active:
+            slaves = fifo_on and master.active and (r[_FIFO_EN] & 7 or r[_I2C_MST_CTRL] & 0x20)
+            first = self._done + 1
+            jump_at = first + (2 if master.active else 0)
+            jump = self._idle_samples(total - jump_at + 1, fifo_on)
+            k = first
+            while k <= total:
+                if k == jump_at and jump:
+                    k += jump
+                    master.skip(jump)
                 self._done = k
                 self._sample_us = self._time(k)
                 self._sample_row = self._row_index(self._sample_us, k)
-                self._words = self._measure()
-                self._half_packet = (self._sample_us, self._packet(), 0)
-                self._push_packet()
+                packet = None
+                if fifo_on:
+                    self._words = self._measure()
+                    packet = self._packet()
+                    if packet and not slaves:
+                        self._queue_packet(self._sample_us, packet)
+                        packet = None
+                if master.active:
+                    master.advance(self._sample_us)
+                    master.sample(self._sample_us, packet)
+                k += 1
         self._done = total
         self._sample_us = self._time(total)
         self._sample_row = self._row_index(self._sample_us, total)
         self._latched = False
-        if r[_INT_ENABLE] & _DATA_RDY:
+        # RM 4.7, WAIT_FOR_ES: not before the slaves' data are in
+        if not (r[_I2C_MST_CTRL] & 0x40 and master.next_us is not None):
+            self._data_ready(self._sample_us)
+
+    def _idle_samples(self, n, fifo_on):
+        """How many of n samples that come in a long gap need no work: what the FIFO would push out
+        again has overflowed, and the auxiliary bus is back in step long before the last 1024."""
+        keep = 1024 if self.master.active else 0
+        if fifo_on:
+            length = self._packet_length()
+            if self._fifo_stops() or not length:
+                return 0
+            keep = max(keep, self.fifo.size // length + 2)
+            if n > keep:
+                self.fifo.skip((n - keep) * length)
+                self._fifo_overflow()
+        return max(0, n - keep)
+
+    def _cycle_done(self, at, packet):
+        """The auxiliary transactions of a sample are through."""
+        if packet is not None:
+            packet.extend(self.master.fifo_bytes(self._registers))
+            if packet and self._registers[_USER_CTRL] & 0x40:
+                self._queue_packet(at, packet)
+        if self._registers[_I2C_MST_CTRL] & 0x40:
+            self._data_ready(at)
+
+    def _data_ready(self, at):
+        if self._registers[_INT_ENABLE] & _DATA_RDY:
             self._status |= _DATA_RDY
-            self._pulse_end = self._sample_us + _PULSE_US
+            self._pulse_end = at + _PULSE_US
 
     def next_event(self):
         """Absolute time in us of the next change of the interrupt pin that the chip makes by
@@ -305,6 +297,8 @@ class MPU6050Chip:
             return self._pulse_end
         if not r[_INT_ENABLE] & _DATA_RDY or not self.awake or (latching and self._status):
             return None
+        if r[_I2C_MST_CTRL] & 0x40 and self.master.next_us is not None:
+            return self.master.next_us
         return self._next_us
 
     def _drive_int(self):
@@ -322,69 +316,6 @@ class MPU6050Chip:
             return 0
         return self.world.index(us - self.world.start_us)
 
-    def _measure(self):
-        """The seven words (accel x y z, temperature, gyro x y z) of the newest sample."""
-        r = self._registers
-        world = self.world
-        us = self._sample_us
-        row = world.row(self._sample_row)
-        words = [row[i] for i in _ORDER]
-        if not self._driven() and self._period[0] < 1000 * self._period[1]:
-            # RM 4.2: the accelerometer's output rate is 1 kHz, faster samples repeat it
-            row = world.row(self._row_index(us - (us - self._epoch) % 1000, 0))
-            words[:3] = [row[i] for i in _ORDER[:3]]
-        accel = _ACCEL_LSB[r[_ACCEL_CONFIG] >> 3 & 3]
-        gyro_num, gyro_den = _GYRO_SCALES[r[_GYRO_CONFIG] >> 3 & 3]
-        world_num, world_den = world.gyro_scale
-        gyro_num, gyro_den = gyro_num * world_den, gyro_den * world_num
-        for i in range(3):
-            if accel != world.accel_lsb_per_g:
-                words[i] = _scaled(words[i], accel, world.accel_lsb_per_g)
-            if gyro_num != gyro_den:
-                words[4 + i] = _scaled(words[4 + i], gyro_num, gyro_den)
-        self._self_test(words, accel)
-        unsettled = self._wake_us + _GYRO_START_US - us
-        if unsettled > 0:
-            num, den = _GYRO_SCALES[r[_GYRO_CONFIG] >> 3 & 3]
-            for i in (4, 5, 6):
-                offset = _GYRO_START_DPS * num * unsettled // (den * _GYRO_START_US)
-                words[i] = _scaled(words[i] + offset, 1, 1)
-        if self.family_6500:
-            # world rows carry the MPU6050's temperature word, raw / 340 + 36.53
-            lsb, zero = (32680, 2500) if self._identity == 0x98 else (33387, 2100)
-            words[3] = _scaled(100 * words[3] + 340 * (3653 - zero), lsb, 340 * 10_000)
-        old = self._words
-        standby = r[_PWR_MGMT_2]
-        for i in range(3):
-            if standby & (0x20 >> i):
-                words[i] = old[i]
-            if standby & (0x04 >> i):
-                words[4 + i] = old[4 + i]
-        if r[_PWR_MGMT_1] & 0x08:  # TEMP_DIS
-            words[3] = old[3]
-        return words
-
-    def _self_test(self, words, accel_lsb):
-        """Add what the actuated proof masses put out: the factory trim, RM 4.1 (in LSB at +-8 g and
-        +-250 deg/s)."""
-        r = self._registers
-        bits = r[_ACCEL_CONFIG] >> 5, r[_GYRO_CONFIG] >> 5
-        if not (bits[0] or bits[1]):
-            return
-        for axis in range(3):
-            n = self.trims[axis]
-            if bits[0] & (4 >> axis) and axis not in self.broken:
-                response = 4096 * 0.34 * (0.92 / 0.34) ** ((n - 1) / 30) if n else 0.5 * 4096
-                words[axis] = _scaled(words[axis] + int(response * accel_lsb / 4096), 1, 1)
-            n = self.trims[3 + axis]
-            if bits[1] & (4 >> axis) and 3 + axis not in self.broken:
-                response = 25 * 131 * 1.046 ** (n - 1) if n else 50 * 131
-                num, den = _GYRO_SCALES[r[_GYRO_CONFIG] >> 3 & 3]
-                response = int(response * num / (den * 131))
-                if axis == 1:
-                    response = -response
-                words[4 + axis] = _scaled(words[4 + axis] + response, 1, 1)
-
     def _settle_words(self):
         """Compute the newest sample's words under the configuration that it was taken with."""
         if not self._latched:
@@ -395,6 +326,7 @@ class MPU6050Chip:
         """RM 4.17: the registers follow the internal set while the bus is idle, so one burst is one
         sample."""
         self._settle_words()
+        self.master.show(self._registers)
         if self._shown is self._words:
             return
         self._shown = self._words
@@ -410,17 +342,6 @@ class MPU6050Chip:
         """FIFO_MODE (CONFIG bit 6, MPU6500 family only): when full, new bytes are refused."""
         return self.family_6500 and self._registers[_CONFIG] & 0x40
 
-    def _fifo_clear(self):
-        self._fifo_head = 0
-        self._fifo_count = 0
-        self._fifo_shadow = 0
-        self._half_packet = None
-
-    def _fifo_skip(self, n):
-        """n bytes went in that later ones push out again."""
-        self._fifo_head = (self._fifo_head + n) % self.fifo_size
-        self._fifo_overflow()
-
     def _fifo_overflow(self):
         if self._registers[_INT_ENABLE] & _FIFO_OFLOW:
             if not self._status & _FIFO_OFLOW:
@@ -435,35 +356,19 @@ class MPU6050Chip:
                 packet.append(self._words[i] & 0xFF)
         return packet
 
+    def _packet_length(self):
+        length = len(self.master.fifo_bytes(self._registers)) if self.master.active else 0
+        for bit in _FIFO_BITS:
+            length += 2 if self._registers[_FIFO_EN] & bit else 0
+        return length
+
+    def _queue_packet(self, at, packet):
+        self.fifo.start(at, packet)
+        self._push_packet()
+
     def _push_packet(self):
-        """Write as much of the packet under way as time allows."""
-        start, packet, written = self._half_packet
-        there = len(packet)
-        if self.fifo_byte_us:
-            there = min(there, (self._now - start) // self.fifo_byte_us + 1)
-        while written < there:
-            self._fifo_push(packet[written])
-            written += 1
-        self._half_packet = (start, packet, written) if written < len(packet) else None
-
-    def _fifo_push(self, byte):
-        size = self.fifo_size
-        if self._fifo_count == size:
-            # RM 4.31: the oldest data are lost, so the first packet left has lost its beginning
+        if self.fifo.fill(self._now, self._fifo_stops()):
             self._fifo_overflow()
-            if self._fifo_stops():
-                return
-            self._fifo_head = (self._fifo_head + 1) % size
-            self._fifo_count -= 1
-        self._fifo[(self._fifo_head + self._fifo_count) % size] = byte
-        self._fifo_count += 1
-
-    def _fifo_pop(self):
-        if self._fifo_count:
-            self._fifo_last = self._fifo[self._fifo_head]
-            self._fifo_head = (self._fifo_head + 1) % self.fifo_size
-            self._fifo_count -= 1
-        return self._fifo_last  # RM 4.31: empty, it returns the last byte again
 
     # Registers
 
@@ -471,15 +376,18 @@ class MPU6050Chip:
         """Read one register with its side effects."""
         r = self._registers
         if register == _FIFO_R_W:
-            value = self._fifo_pop()
+            value = self.fifo.pop()
         elif register == _INT_STATUS:
             value = self._status
             self._status = 0
         elif register == _FIFO_COUNTH:
-            self._fifo_shadow = self._fifo_count  # RM 4.30: latches both bytes
-            value = self._fifo_shadow >> 8
+            self.fifo.shadow = self.fifo.count  # RM 4.30: latches both bytes
+            value = self.fifo.shadow >> 8
         elif register == _FIFO_COUNTL:
-            value = self._fifo_shadow & 0xFF
+            value = self.fifo.shadow & 0xFF
+        elif register == _I2C_MST_STATUS:
+            value = self.master.status
+            self.master.status = 0  # RM 4.13: reading clears it
         else:
             value = r[register]
         if register == _PWR_MGMT_1 and self._now < self._reset_until:
@@ -494,15 +402,17 @@ class MPU6050Chip:
         r = self._registers
         if _INT_STATUS <= register <= 0x60 or _FIFO_COUNTH <= register <= _FIFO_COUNTL:
             return  # read only
-        if register in (_WHO_AM_I, 0x36):
+        if register in (_WHO_AM_I, _I2C_MST_STATUS, _SLV4_DI):
             return
         if register == _PWR_MGMT_1 and value & 0x80:
             self._plain = False
+            self.master.stop(self._now, "DEVICE_RESET")
             self._power_on_reset()
             self._reset_until = self._now + self.reset_us
             return
         if register == _FIFO_R_W:
-            self._fifo_push(value)
+            if self.fifo.push(value, self._fifo_stops()):
+                self._fifo_overflow()
             return
         self._settle_words()
         self._quiet_until = 0
@@ -517,43 +427,47 @@ class MPU6050Chip:
                 self._wake_us = self._now
             if (old ^ value) & 0x47:
                 self._restart_clock()
-        elif register in (_SMPLRT_DIV, _CONFIG) and old != value:
+        elif register in self._rate_registers and old != value:
             self._restart_clock()
+        elif _I2C_MST_CTRL <= register <= _SLV4_CTRL or register in (_USER_CTRL, _MST_DELAY_CTRL):
+            self.master.configured(r, r[_USER_CTRL] & 0x20)
         self._drive_int()
 
     def _user_ctrl(self, value):
-        if value & 0x10:  # I2C_IF_DIS
-            self.misuse.append("I2C_IF_DIS set on an I2C part")
-            self._i2c_disabled = self.family_6500
-        if value & 0x04:
-            # RM 4.27: FIFO_RESET works while FIFO_EN equals 0; the RM-MPU-6500A has no such
+        self._i2c_if_dis(value & 0x10)
+        master = self.master
+        if master.on and not value & 0x20:
+            master.stop(self._now, "I2C_MST_EN cleared")
+        if value & 0x02:
+            # RM 4.27: I2C_MST_RESET works while I2C_MST_EN equals 0; the RM-MPU-6500A has no such
             # condition
-            if value & 0x40 and not self.family_6500:
-                self.misuse.append("FIFO_RESET with FIFO_EN set")
+            if value & 0x20 and not self.family_6500:
+                self._misused("I2C_MST_RESET with I2C_MST_EN set")
             else:
-                self._fifo_clear()
+                master.stop(self._now, "I2C_MST_RST")
+        if value & 0x04:
+            # RM 4.27: the same of FIFO_RESET and FIFO_EN
+            if value & 0x40 and not self.family_6500:
+                self._misused("FIFO_RESET with FIFO_EN set")
+            else:
+                self.fifo.clear()
         if not value & 0x40:
-            self._half_packet = None
+            self.fifo.packet = None
         if value & 0x01:  # SIG_COND_RESET clears the sensor registers
             self._words = [0] * 7
+            master.clear_data()
         return value & ~0x07  # the reset bits clear themselves
+
+    def _i2c_if_dis(self, bit):
+        if bit:
+            self._misused("I2C_IF_DIS set on an I2C part")
+            self._i2c_disabled = self.family_6500
 
     # I2C
 
-    def _acknowledge(self):
-        if self._gone or self._i2c_disabled or self._now < self._dead_until:
-            return False
-        if self._nacks:
-            if self._nack_skip:
-                self._nack_skip -= 1
-            else:
-                self._nacks -= 1
-                return False
-        return True
-
     def i2c_start(self, read, now):
         self.poll(now)
-        if not self._acknowledge():
+        if self._i2c_disabled or not self._acknowledge():
             self._busy = False
             return False
         if not self._busy:
@@ -565,7 +479,7 @@ class MPU6050Chip:
 
     def i2c_write(self, byte, now):
         self.poll(now)
-        if not self._acknowledge():
+        if self._i2c_disabled or not self._acknowledge():
             self._busy = False
             return False
         if self._pointing:
@@ -591,7 +505,7 @@ class MPU6050Chip:
                 self._pointer = at + 1
                 return self._registers[at]
             if at == _FIFO_R_W:
-                return self._fifo_pop()
+                return self.fifo.pop()
         if self._gone or self._now < self._dead_until:
             return 0xFF  # nobody pulls the line down
         value = self._get(self._pointer)
