@@ -1,0 +1,697 @@
+"""The IST8310 driver behind an MPU and on a bus of its own: each measurement once, and what goes wrong."""
+
+from array import array
+from itertools import pairwise
+
+import kernel
+import machine
+import pytest
+from auxiliary_bus import AuxiliaryBus
+from chips.ist8310 import IST8310Chip
+from chips.mpu6050 import MPU6050Chip
+from chips.mpu6500 import MPU6500Chip
+from ist8310 import IST8310, IST8310_I2C, IST8310Error
+from mpu6050 import MPU6050
+from mpu6500 import MPU6500, MPU6500_I2C
+from world import StillWorld
+
+FRESH, MAG_FRESH = 1, 2
+FIELD = (100, -200, 300)
+WAI, STAT1, CNTL1, CNTL2, AVGCNTL, PDCNTL = 0x00, 0x02, 0x0A, 0x0B, 0x41, 0x42
+SLV4_CTRL, PWR_MGMT_1 = 0x34, 0x6B
+
+
+class Moving(StillWorld):
+    """Another field at every microsecond that somebody looks at it, the same on all three axes."""
+
+    def row(self, k):
+        self._row[6] = self._row[7] = self._row[8] = 1 + (kernel.now() // 100) % 5000
+        return self._row
+
+
+class Rig:
+    """An IMU with an IST8310 behind it, and the tick of the firmware: read, and health now and then."""
+
+    def __init__(self, kind, world=None, rate=1000):
+        self.world = world or StillWorld((10, -20, 4096, 5, 6, -7, *FIELD, -521))
+        if kind == "spi":
+            self.chip = MPU6500Chip(self.world)
+            machine.wire_spi(5, self.chip, cs="PF6")
+            cs = machine.Pin("PF6", machine.Pin.OUT, value=1)
+            self.imu = MPU6500(machine.SPI(5, 1_000_000), cs)
+        else:
+            kinds = {"i2c": (MPU6050Chip, MPU6050), "6500 on i2c": (MPU6500Chip, MPU6500_I2C)}
+            model, driver = kinds[kind]
+            self.chip = model(self.world)
+            machine.wire_i2c(0, self.chip)
+            self.imu = driver(machine.I2C(0, freq=400_000))
+        self.mag_chip = IST8310Chip(self.world)
+        self.chip.aux.append(self.mag_chip)
+        self.imu.configure(sample_rate_hz=rate)
+        self.period = 1_000_000 // rate
+        self.mag = IST8310(AuxiliaryBus(self.imu))
+        self.steps = 0
+
+    def tick(self):
+        kernel.advance(self.period - kernel.now() % self.period)
+        flags = self.imu.read()
+        self.steps += 1
+        if not flags & FRESH or not self.steps % 8:
+            self.imu.health()
+        return flags
+
+    def run(self, n):
+        """The ticks (0..n-1) that had a fresh measurement."""
+        return [i for i in range(n) if self.tick() & MAG_FRESH]
+
+    def until(self, bit, most=2000):
+        """Microseconds until a sample has this bit."""
+        start = kernel.now()
+        for _ in range(most):
+            if self.tick() & bit:
+                return kernel.now() - start
+        raise AssertionError(f"no bit {bit} in {most} ticks")
+
+
+KINDS = ("spi", "i2c", "6500 on i2c")
+
+
+@pytest.fixture(params=KINDS)
+def rig(request):
+    return Rig(request.param)
+
+
+def gaps(ticks):
+    return {b - a for a, b in pairwise(ticks)}
+
+
+# Set-up
+
+
+def test_configure_finds_resets_and_configures_it(rig):
+    rig.mag_chip.log = log = []
+    start = kernel.now()
+    rig.mag.configure()
+    took = kernel.now() - start
+    written = {register: value for _, register, value in log if register != CNTL1}
+    assert written == {CNTL2: 0x0C, AVGCNTL: 0x24, PDCNTL: 0xC0}
+    assert (CNTL2, 0x01) in [(register, value) for _, register, value in log]
+    assert took < rig.mag_chip.reset_us + 20_000  # its reset bit is waited for, not a fixed time
+    assert rig.mag.present
+    assert rig.mag.chip == "IST8310"
+    assert rig.mag.lsb_per_uT == (33, 10)
+    assert rig.mag.sample_rate == (100, 1)
+    assert rig.chip.misuse == rig.mag_chip.misuse == []
+
+
+def test_an_absent_magnetometer_is_named_in_good_time(rig):
+    rig.mag_chip.vanish()
+    start = kernel.now()
+    with pytest.raises(IST8310Error, match=r"no IST8310 at 0x0e behind the MPU6.*acknowledge"):
+        rig.mag.configure()
+    assert kernel.now() - start < 150_000
+    assert not rig.mag.present
+
+
+def test_a_magnetometer_that_is_late_after_power_up_is_waited_for(rig):
+    rig.mag_chip.power_up_us = 50_000
+    rig.mag_chip.brown_out(kernel.now())
+    rig.mag.configure()
+
+
+def test_another_chip_at_its_address_is_refused_and_shown(rig):
+    rig.mag_chip.stick(WAI, 0x48)
+    with pytest.raises(IST8310Error, match=r"0x0e behind the MPU6.*0x48.*0x10"):
+        rig.mag.configure()
+
+
+def test_an_identity_that_was_overwritten_is_mended_by_a_reset(rig):
+    rig.mag_chip._registers[WAI] = 0x55
+    rig.mag.configure()
+    assert rig.run(30)
+
+
+@pytest.mark.parametrize("register", [CNTL2, AVGCNTL, PDCNTL])
+def test_a_register_that_does_not_keep_its_value_is_reported(rig, register):
+    rig.mag_chip.stick(register, 0x00)
+    with pytest.raises(IST8310Error, match=rf"register 0x{register:02x} .* read 0x00"):
+        rig.mag.configure()
+
+
+def test_a_magnetometer_stuck_in_reset_is_reported(rig):
+    rig.mag_chip.stick(CNTL2, 0x01)
+    with pytest.raises(IST8310Error, match="did not come out of reset"):
+        rig.mag.configure()
+
+
+def test_an_imu_that_sleeps_is_blamed_and_not_the_magnetometer(rig):
+    rig.imu.sleep()
+    with pytest.raises(IST8310Error, match="IMU awake"):
+        rig.mag.configure()
+
+
+@pytest.mark.parametrize(
+    "sample_rate, rate_hz, average, n",
+    [
+        (1000, 100, 16, 10),
+        (1000, 142, 16, 8),
+        (1000, 143, 16, 7),
+        (1000, 180, 4, 6),
+        (1000, 32, 1, 32),
+        ((2000, 7), 160, 16, 2),
+        ((2000, 7), 100, 16, 3),
+        (200, 100, 16, 2),
+        (100, 100, 16, 2),  # never faster than every second sample
+        (500, (100, 3), 8, 15),
+    ],
+)
+def test_the_rate_is_the_next_lower_part_of_the_sample_rate(sample_rate, rate_hz, average, n):
+    mag = Rig("i2c").mag
+    mag.configure(rate_hz, average, sample_rate)
+    num, den = sample_rate if isinstance(sample_rate, tuple) else (sample_rate, 1)
+    assert mag.sample_rate[0] * den * n == num * mag.sample_rate[1]
+
+
+@pytest.mark.parametrize(
+    "arguments, what",
+    [
+        # a trigger every 6 ms leaves no room for the two chips' clocks
+        ({"rate_hz": 167}, "at most 1000/7 Hz"),
+        ({"rate_hz": 250}, "at most 1000/7 Hz"),
+        ({"rate_hz": 200, "average": 4}, "at most 1000/6 Hz"),
+        ({"rate_hz": 31}, "a 32nd of 1000/1"),
+        ({"rate_hz": 0}, "rate_hz 0"),
+        ({"rate_hz": 100.0}, "rate_hz 100.0"),
+        ({"average": 3}, "average 3 is not one of 1, 2, 4, 8, 16"),
+        ({"sample_rate": 8000, "rate_hz": 250}, "no rate at all"),
+    ],
+)
+def test_what_the_chip_cannot_do_is_refused(arguments, what):
+    with pytest.raises(ValueError, match=what):
+        Rig("i2c").mag.configure(**arguments)
+
+
+# Samples
+
+
+def test_every_measurement_is_delivered_once(rig):
+    rig.mag.configure()
+    rig.until(MAG_FRESH)
+    ticks = rig.run(1000)
+    assert len(ticks) == 100
+    assert gaps(ticks) == {10}
+    assert tuple(rig.imu.counts[6:9]) == FIELD
+    assert rig.mag.fresh == 101
+    assert rig.mag_chip.measurements - rig.mag.fresh in (0, 1)
+    assert (rig.mag.stale, rig.mag.saturated, rig.mag.unflagged) == (0, 0, 0)
+    assert (rig.mag.errors, rig.mag.resets, rig.imu.resets, rig.imu.errors) == (0, 0, 0, 0)
+    assert rig.chip.misuse == rig.mag_chip.misuse == []
+
+
+@pytest.mark.parametrize("rate, n", [(500, 5), (250, 3), (200, 2), (100, 2)])
+def test_other_sample_rates_of_the_imu(rate, n):
+    rig = Rig("spi", rate=rate)
+    rig.mag.configure(rate_hz=100)
+    rig.until(MAG_FRESH)
+    ticks = rig.run(200)
+    assert gaps(ticks) == {n}
+    assert rig.mag.stale == 0
+
+
+def test_between_measurements_the_words_stay_and_bit_1_is_clear(rig):
+    rig.mag.configure()
+    rig.until(MAG_FRESH)
+    rig.world.set((0, 0, 4096, 0, 0, 0, 7, 8, 9))
+    flags = rig.tick()
+    assert flags & FRESH and not flags & MAG_FRESH
+    assert tuple(rig.imu.counts[6:9]) == FIELD
+    rig.run(25)
+    assert tuple(rig.imu.counts[6:9]) == (7, 8, 9)
+
+
+def test_the_fifo_carries_it_too(rig):
+    rig.mag.configure()
+    rig.imu.fifo_enable(batch=10)
+    fresh = packets = 0
+    for _ in range(100):
+        kernel.advance(10_000 - kernel.now() % 10_000)
+        for _ in range(rig.imu.fifo_poll()):
+            flags = rig.imu.fifo_next()
+            packets += flags & FRESH
+            fresh += flags >> 1 & 1
+        rig.imu.health()
+    assert packets > 950
+    assert abs(fresh - packets // 10) <= 2
+    assert rig.imu.fifo_overflows == rig.mag.stale == rig.imu.resets == 0
+    assert tuple(rig.imu.counts[6:9]) == FIELD
+
+
+def test_a_field_beyond_the_range_is_withheld_and_counted(rig):
+    rig.mag.configure()
+    rig.until(MAG_FRESH)
+    for word in range(3):
+        field = [0, 0, 0]
+        field[word] = -8192 if word == 2 else -5281  # z is out of 14 bits before it is out of range
+        rig.world.set((0, 0, 4096, 0, 0, 0, *field))
+        rig.run(20)
+        saturated = rig.mag.saturated
+        rig.run(100)
+        if word < 2:
+            assert rig.mag.saturated - saturated == 10
+    rig.mag_chip._registers[0x0D] = 0x70  # 16 bits: four times as many counts
+    rig.world.set((0, 0, 4096, 0, 0, 0, 0, 0, 2100))
+    rig.run(20)
+    saturated = rig.mag.saturated
+    rig.run(100)
+    assert rig.mag.saturated - saturated == 10
+    assert rig.mag.stale == 0
+
+
+@pytest.mark.parametrize("took", range(5500, 6121, 40))
+def test_a_measurement_that_ends_at_any_moment_of_the_round_is_delivered_once_and_whole(took):
+    rig = Rig("i2c", Moving())
+    rig.mag.configure()
+    rig.mag_chip.measure_us = took
+    rig.until(MAG_FRESH)
+    rig.run(20)
+    seen = set()
+    for _ in range(300):
+        if rig.tick() & MAG_FRESH:
+            x, y, z = rig.imu.counts[6:9]
+            assert x == y == z  # none made of two measurements
+            seen.add(x)
+    assert len(seen) == 30
+    assert rig.mag.stale == 0
+
+
+def test_without_dren_measurements_are_still_found_by_their_data():
+    """The IST8310 example that is widely copied writes CNTL2 = 0, and with it DRDY is never set."""
+    rig = Rig("i2c", Moving())
+    rig.mag.configure()
+    rig.until(MAG_FRESH)
+    rig.mag_chip.poke(CNTL2, 0)
+    fresh = rig.mag.fresh
+    for _ in range(100):
+        kernel.advance(1000 - kernel.now() % 1000)
+        rig.imu.read()
+    assert abs(rig.mag.fresh - fresh - 10) <= 1
+    assert rig.mag.unflagged >= 9
+
+
+def trigger_every_4_samples(rig):
+    """What the widely copied example does: SLV4_CTRL = 3 with an average of 16, which needs 6 ms."""
+    rig.chip.poke(SLV4_CTRL, 3)
+
+
+def read_only(rig, n):
+    """Ticks without health(), which would put the register right."""
+    fresh = rig.mag.fresh
+    stale = rig.mag.stale
+    for _ in range(n):
+        kernel.advance(1000 - kernel.now() % 1000)
+        rig.imu.read()
+    return rig.mag.fresh - fresh, rig.mag.stale - stale
+
+
+def test_triggers_that_come_too_fast_show_as_stale(rig):
+    rig.mag.configure()
+    rig.mag_chip.restarts = True  # each begins the measurement anew
+    rig.until(MAG_FRESH)
+    assert read_only(rig, 100) == (10, 0)
+    trigger_every_4_samples(rig)
+    read_only(rig, 10)
+    fresh, stale = read_only(rig, 1000)
+    assert (fresh, stale) == (0, 100)
+
+
+def test_a_driver_that_believed_in_4_ms_would_count_every_second_one_as_stale(rig):
+    rig.mag.configure()  # it refuses rate_hz=250
+    trigger_every_4_samples(rig)  # the ones in between are lost
+    rig.mag._state[7] = 4  # the samples that it expects between two measurements,
+    rig.mag._state[6] = 4 + 3  # and those that it waits
+    read_only(rig, 20)
+    fresh, stale = read_only(rig, 1000)
+    assert fresh == 125 and stale == 125  # of the 250 that were asked for
+
+
+def test_health_puts_the_period_right(rig):
+    rig.mag.configure()
+    rig.run(20)
+    trigger_every_4_samples(rig)
+    rig.run(600)
+    assert rig.chip.register(SLV4_CTRL) & 0x1F == 9
+    assert rig.imu.resets <= 1  # where a transaction of slot 4 has not put it right before
+    assert gaps(rig.run(200)) == {10}
+
+
+def test_bytes_that_a_silent_magnetometer_leaves_behind_are_not_used_again(rig):
+    rig.mag.configure()
+    for phase in range(12):
+        rig.until(MAG_FRESH)
+        for _ in range(phase):
+            rig.tick()
+        rig.mag_chip.vanish()
+        rig.tick()
+        fresh, stale = read_only(rig, 60)
+        assert fresh == 0 and stale >= 4
+        rig.mag_chip.come_back()
+        rig.until(MAG_FRESH)
+
+
+def test_a_bus_that_nobody_drives_is_no_measurement(rig):
+    rig.mag.configure()
+    rig.until(MAG_FRESH)
+    counts = rig.imu.counts
+    for status, byte in ((0xFF, 0xFF), (0x00, 0x00), (0x01 | 0x80, 0x12), (0x00, 0x00)):
+        raw = bytes([status]) + bytes([byte]) * 6
+        for _ in range(3):
+            assert rig.mag.take(raw, 0, counts) == 0
+
+
+# Faults in the tick
+
+
+def test_absent_at_the_start_it_is_found_and_configured_by_the_tick(rig):
+    rig.mag_chip.vanish()
+    with pytest.raises(IST8310Error):
+        rig.mag.configure()
+    rig.mag.attach()
+    assert rig.run(500) == []
+    assert rig.imu.counts[10] & FRESH
+    assert rig.imu.errors == rig.imu.resets == 0
+    assert not rig.mag.present
+    assert rig.mag.errors > 5
+    assert rig.mag.stale > 40
+    rig.mag_chip.come_back()
+    rig.mag_chip.misuse.clear()  # until then it was triggered as it came
+    assert rig.until(MAG_FRESH) < 500_000
+    assert rig.mag.present
+    assert rig.mag.resets == 1
+    assert rig.mag_chip.register(AVGCNTL) == 0x24
+    assert rig.mag_chip.register(PDCNTL) == 0xC0
+    assert gaps(rig.run(300)) == {10}
+    assert rig.imu.resets == 0
+
+
+def test_vanishing_in_flight_and_coming_back(rig):
+    rig.mag.configure()
+    rig.until(MAG_FRESH)
+    rig.mag_chip.vanish()
+    rig.run(2)
+    assert rig.run(1000) == []
+    assert rig.imu.counts[10] & FRESH
+    assert not rig.mag.present
+    assert rig.mag.errors > 10
+    errors = rig.imu.errors
+    rig.mag_chip.come_back()
+    assert rig.until(MAG_FRESH) < 500_000
+    assert rig.mag.resets == 0  # it kept its registers
+    assert rig.imu.errors == errors == 0
+    assert gaps(rig.run(300)) == {10}
+    assert rig.chip.misuse == []
+
+
+def test_a_reset_of_the_magnetometer_alone_is_noticed_and_mended(rig):
+    rig.mag.configure()
+    rig.until(MAG_FRESH)
+    rig.mag_chip.power_up_us = 50_000
+    rig.mag_chip.brown_out(kernel.now())
+    assert rig.until(MAG_FRESH) < 500_000
+    rig.run(500)
+    assert rig.mag.resets == 1
+    assert rig.mag_chip.register(AVGCNTL) == 0x24
+    assert rig.mag_chip.register(PDCNTL) == 0xC0
+    assert gaps(rig.run(300)) == {10}
+    assert rig.imu.resets == rig.imu.errors == 0
+
+
+@pytest.mark.parametrize("both", [False, True])
+def test_a_reset_of_the_imu_in_flight(rig, both):
+    rig.mag.configure()
+    rig.until(MAG_FRESH)
+    rig.chip.log = log = []
+    rig.chip.brown_out(kernel.now())
+    if both:
+        rig.mag_chip.brown_out(kernel.now())
+    start = kernel.now()
+    while rig.imu.resets == 0:
+        rig.tick()
+        assert kernel.now() - start < 200_000
+    while not rig.tick() & FRESH:
+        assert kernel.now() - start < 200_000
+    rig.until(MAG_FRESH)
+    assert kernel.now() - start < 500_000
+    rig.run(500)
+    assert rig.imu.resets == 1
+    assert rig.mag.resets == both
+    assert not [value for _, register, value in log if register == PWR_MGMT_1 and value & 0x80]
+    assert gaps(rig.run(300)) == {10}
+
+
+def test_an_identity_lost_in_flight_is_mended_by_a_soft_reset(rig):
+    rig.mag.configure()
+    rig.until(MAG_FRESH)
+    rig.mag_chip._registers[WAI] = 0x11
+    rig.run(1000)
+    assert rig.mag_chip.register(WAI) == 0x10
+    assert rig.mag_chip.register(PDCNTL) == 0xC0
+    assert rig.mag.resets == 1
+    assert gaps(rig.run(300)) == {10}
+
+
+def test_while_a_register_is_wrong_nothing_is_delivered(rig):
+    rig.mag.configure()
+    rig.until(MAG_FRESH)
+    rig.mag_chip.stick(PDCNTL, 0x00)
+    rig.run(400)
+    assert rig.run(600) == []
+    rig.mag_chip.stick(PDCNTL)
+    assert rig.until(MAG_FRESH) < 500_000
+    assert (
+        rig.mag.resets == 2
+    )  # found wrong, written, found wrong again; however often it was written
+
+
+def test_one_missing_acknowledge_costs_one_measurement_at_the_most(rig):
+    rig.mag.configure()
+    rig.until(MAG_FRESH)
+    for after in range(0, 90, 3):
+        rig.mag_chip.nack_next(1, after)
+        assert gaps(rig.run(60)) <= {9, 10, 11, 19, 20, 21}
+    assert rig.mag.resets == 0
+
+
+def test_one_look_at_a_register_that_fails_costs_nothing(rig, monkeypatch):
+    rig.mag.configure()
+    rig.until(MAG_FRESH)
+    write = rig.mag_chip.i2c_write
+    refused = []
+
+    def refusing(byte, now):
+        """Every second time that somebody points at PDCNTL."""
+        if rig.mag_chip._pointing and byte == PDCNTL:
+            refused.append(now)
+            if len(refused) % 2:
+                return False
+        return write(byte, now)
+
+    monkeypatch.setattr(rig.mag_chip, "i2c_write", refusing)
+    assert gaps(rig.run(1000)) == {10}
+    assert rig.mag.errors == (len(refused) + 1) // 2 >= 5
+    assert rig.mag.present
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_storm_of_missing_acknowledges_costs_measurements_and_nothing_else(rig, seed):
+    rig.mag.configure()
+    rig.until(MAG_FRESH)
+    state = seed + 1
+    for _ in range(1000):
+        state = state * 1103515245 + 12345 & 0x7FFFFFFF
+        if state >> 16 & 3 == 0:
+            rig.mag_chip.nack_next(1 + (state >> 20 & 7), after=state >> 24 & 3)
+        assert rig.tick() & FRESH
+    rig.mag_chip.nack_next(0)
+    assert rig.mag.errors > 10
+    assert rig.until(MAG_FRESH) < 500_000
+    assert rig.imu.resets == rig.imu.errors == rig.imu.stale == 0
+    assert rig.mag.fresh < 90
+    rig.run(500)
+    assert gaps(rig.run(300)) == {10}
+    assert rig.chip.misuse == []
+
+
+def test_health_costs_two_accesses_at_the_most(rig, monkeypatch):
+    rig.mag_chip.vanish()
+    with pytest.raises(IST8310Error):
+        rig.mag.configure()
+    rig.mag.attach()
+    accesses = []
+    imu, read, write = rig.imu, rig.imu._read_into, rig.imu._write
+    monkeypatch.setattr(imu, "_read_into", lambda r, b: accesses.append(r) or read(r, b))
+    monkeypatch.setattr(imu, "_write", lambda r, v: accesses.append(r) or write(r, v))
+    for i in range(300):
+        if i == 100:
+            rig.mag_chip.come_back()
+        kernel.advance(1000)
+        accesses.clear()
+        rig.mag.health()
+        assert len(accesses) <= 2
+    assert rig.mag.present
+
+
+def test_configure_again_with_another_rate(rig):
+    rig.mag.configure(rate_hz=100)
+    rig.run(50)
+    rig.mag.configure(rate_hz=50)
+    rig.until(MAG_FRESH)
+    assert gaps(rig.run(400)) == {20}
+    rig.imu.configure(sample_rate_hz=1000)
+    assert rig.run(50) == []
+    rig.mag.configure()
+    rig.until(MAG_FRESH)
+    assert gaps(rig.run(300)) == {10}
+    assert rig.imu.resets == 0
+    assert rig.chip.misuse == []
+
+
+# Directly on a bus
+
+
+class Direct:
+    """An IST8310 on I2C 1, read at rate Hz."""
+
+    def __init__(self, rate=200, world=None):
+        self.world = world or StillWorld((0, 0, 4096, 0, 0, 0, *FIELD))
+        self.chip = IST8310Chip(self.world)
+        self.bus = machine.wire_i2c(1, self.chip)
+        self.mag = IST8310_I2C(machine.I2C(1, freq=400_000))
+        self.counts = array("h", bytes(22))
+        self.rate = rate
+        self.period = 1_000_000 // rate
+
+    def configure(self, **arguments):
+        self.mag.configure(sample_rate=self.rate, **arguments)
+
+    def tick(self):
+        kernel.advance(self.period - kernel.now() % self.period)
+        self.counts[10] = FRESH
+        flags = self.mag.read(self.counts)
+        assert flags == self.counts[10] and flags & FRESH
+        return flags
+
+    def run(self, n):
+        return [i for i in range(n) if self.tick() & MAG_FRESH]
+
+    def until(self, most=1000):
+        start = kernel.now()
+        for _ in range(most):
+            if self.tick() & MAG_FRESH:
+                return kernel.now() - start
+        raise AssertionError("no measurement")
+
+
+@pytest.mark.parametrize("rate, n", [(1000, 10), (500, 5), (200, 2), (100, 2)])
+def test_on_a_bus_every_measurement_is_delivered_once(rate, n):
+    rig = Direct(rate)
+    rig.configure()
+    rig.until()
+    assert gaps(rig.run(300)) == {n}
+    assert tuple(rig.counts[6:9]) == FIELD
+    assert (rig.mag.stale, rig.mag.errors, rig.mag.resets) == (0, 0, 0)
+    assert rig.mag.sample_rate == (rate // n, 1)
+    assert rig.chip.misuse == []
+
+
+def test_on_a_bus_it_is_left_alone_while_it_measures():
+    rig = Direct(1000)
+    rig.configure()
+    rig.until()
+    busy = []
+    for _ in range(10):
+        before = rig.bus.bytes
+        rig.tick()
+        busy.append(rig.bus.bytes - before)
+    assert busy.count(0) >= 5
+    assert max(busy) <= 16
+
+
+def test_on_a_bus_an_absent_one_is_named_and_found_later():
+    rig = Direct()
+    rig.chip.vanish()
+    with pytest.raises(IST8310Error, match=r"no IST8310 at 0x0e \("):
+        rig.configure()
+    rig.mag.attach()
+    assert rig.run(300) == []
+    assert rig.mag.errors > 50 and not rig.mag.present
+    rig.chip.come_back()
+    assert rig.until() < 500_000
+    assert rig.mag.resets == 1
+    assert rig.chip.register(AVGCNTL) == 0x24 and rig.chip.register(PDCNTL) == 0xC0
+    assert gaps(rig.run(200)) == {2}
+
+
+def test_on_a_bus_vanishing_and_coming_back():
+    rig = Direct()
+    rig.configure()
+    rig.until()
+    rig.chip.vanish()
+    assert rig.run(200) == []
+    assert rig.mag.stale > 30
+    rig.chip.come_back()
+    assert rig.until() < 500_000
+    assert rig.mag.resets == 0
+    assert gaps(rig.run(200)) == {2}
+
+
+@pytest.mark.parametrize("rate", [1000, 200])
+def test_on_a_bus_a_reset_is_noticed_and_mended(rate):
+    rig = Direct(rate)
+    rig.configure()
+    rig.until()
+    rig.chip.brown_out(kernel.now())
+    rig.tick()
+    assert rig.until() < 500_000
+    rig.run(rate)
+    assert rig.mag.resets == 1
+    assert rig.chip.register(AVGCNTL) == 0x24 and rig.chip.register(PDCNTL) == 0xC0
+    assert gaps(rig.run(100)) == {rate // 100}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_on_a_bus_a_storm_of_missing_acknowledges(seed):
+    rig = Direct()
+    rig.configure()
+    rig.until()
+    state = seed + 1
+    for _ in range(2000):
+        state = state * 1103515245 + 12345 & 0x7FFFFFFF
+        if state >> 16 & 3 == 0:
+            rig.chip.nack_next(1 + (state >> 20 & 7), after=state >> 24 & 3)
+        rig.tick()
+    rig.chip.nack_next(0)
+    assert rig.mag.errors > 100
+    assert rig.until() < 500_000
+    rig.run(50)
+    assert gaps(rig.run(200)) == {2}
+
+
+def test_on_a_bus_a_trigger_that_was_lost_is_given_again():
+    rig = Direct(1000)
+    rig.configure()
+    rig.until()
+    rig.chip.poke(CNTL1, 0)  # stops a measurement under way
+    rig.run(5)
+    rig.chip.poke(CNTL1, 0)
+    assert rig.run(40)
+    assert rig.mag.stale <= 1
+
+
+# On the real interpreters
+
+
+def test_the_tick_allocates_nothing(micropython_runtime, portable):
+    lines = portable(micropython_runtime, "ist8310_alloc.py").splitlines()
+    assert len(lines) == 9
+    assert all(" ok 0 " in line for line in lines[:8])
+    assert lines[8].endswith("found")
