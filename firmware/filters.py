@@ -2,7 +2,7 @@
 
 import mahony
 
-FILTERS = {"mahony6": mahony.Mahony6}
+FILTERS = {"mahony6": mahony.Mahony6, "mahony9": mahony.Mahony9}
 
 
 def make(name, rate, imu, gains):

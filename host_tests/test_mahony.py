@@ -53,7 +53,7 @@ def float_history(rendered, kp, ki, bias=None, **options):
 
 @pytest.fixture
 def history(portable, tmp_path):
-    """history(runtime, rendered, kp, ki, *bias): the integer filter over all rows, (n, 4) int32."""
+    """history(runtime, rendered, kp, ki, *bias): the six-axis filter over all rows, (n, 4) int32."""
 
     def run(runtime, rendered, kp, ki, *bias):
         world, out = tmp_path / "world.imu", tmp_path / "q"

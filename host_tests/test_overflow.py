@@ -38,13 +38,13 @@ def largest(make, low, high):
     return low
 
 
-def corners(mahony):
+def corners(kind):
     """(rate, full scale, kp, ki, bias limit) at the ends of the ranges that the constructor accepts."""
     out = []
     for fsr, limit in ((2000, 20), (2000, 250), (250, 20), (500, 0)):
 
         def make(rate, kp=0, ki=0, fsr=fsr, limit=limit):
-            return mahony.Mahony6(rate, SCALES[fsr], 2048, kp, ki, limit)
+            return kind(rate, SCALES[fsr], 2048, kp, ki, limit)
 
         slow = -largest(lambda v, make=make: make(-v), -100, -1)
         fast = largest(make, 1000, 1 << 20)
@@ -52,7 +52,11 @@ def corners(mahony):
             kp = largest(lambda v, r=rate, make=make: make(r, kp=v / 1000), 0, 10**9) / 1000
             ki = largest(lambda v, r=rate, make=make: make(r, ki=v / 1000), 0, 10**11) / 1000
             out.append((rate, fsr, kp, min(ki, 1e6), limit))
-    out.append((50, 2000, 20, 1, 20))
+            # gains at which a magnetometer sample may stand for many steps, with an integral of
+            # few and of many bits
+            for little in (min(ki, 1e6), min(ki, 1), 3e-6 if rate <= 8000 else 1e-4):
+                out.append((rate, fsr, min(kp, 0.5), little, limit))
+    out.append((50, 2000, 10, 1, 20))
     return out
 
 
@@ -79,19 +83,60 @@ def extreme_counts(rng):
             return rng.choice((-32768, 32767))
         return rng.randint(-32768, 32767) if c < 0.8 else rng.randint(-1200, 1200)
 
-    flags = rng.choice((0, 1, 1, 1, 1, 3, 5, 9))
+    flags = rng.choice((0, 1, 3, 3, 3, 7, 5, 9))
     return array("h", [word() for _ in range(10)] + [flags])
 
 
-def test_nothing_leaves_32_bits_at_the_corners_of_the_accepted_range(checked):
+def turned_back(q, v):
+    """The earth vector v in the body of attitude q (Q29)."""
+    w, x, y, z = (c / ONE for c in q)
+    r = (
+        (w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z),
+    )
+    return [sum(r[j][i] * v[j] for j in range(3)) for i in range(3)]
+
+
+# Lengths of a field that are scaled to nearly 2**16 and to 2**15, then any
+FIELDS = (32766.9, 16383.9, 2047.9, 32766, 16384, 16385, 8192, 128, 16, 50, 165, 333)
+
+
+def extreme_field(rng, q):
+    """(counts, earth-frame error) of a field that is as wrong as can be, in a few ways."""
+    h = rng.choice(
+        (
+            (0, 1, 0),
+            (0, -1, 0),
+            (-1, 0, 0),
+            (0, 1, 1),
+            (0, -1, 1),
+            (-1, 1e-3, 1),
+            (-1e-3, 0, -1),
+            (0, 0, 1),
+            (1e-4, 1e-4, 1),
+            [rng.gauss(0, 1) for _ in range(3)],
+        )
+    )
+    norm = math.sqrt(sum(v * v for v in h))
+    h = [v / norm for v in h]
+    length = rng.choice(FIELDS)
+    m = [max(-32767, min(32766, round(v * length))) for v in turned_back(q, h)]
+    bx = math.hypot(h[0], h[1])
+    return m, (h[1] * h[2], h[2] * (bx - h[0]), -h[1] * bx)
+
+
+@pytest.mark.parametrize("name", ["Mahony6", "Mahony9"])
+def test_nothing_leaves_32_bits_at_the_corners_of_the_accepted_range(checked, name):
     _, _, mahony = checked
+    kind = getattr(mahony, name)
     rng = random.Random(1)
     out = array("i", bytes(12))
     limit = 8192 * 256
-    for rate, fsr, kp, ki, bias_limit in corners(mahony):
-        filter = mahony.Mahony6(rate, SCALES[fsr], 2048, kp, ki, bias_limit)
+    for rate, fsr, kp, ki, bias_limit in corners(kind):
+        filter = kind(rate, SCALES[fsr], 2048, kp, ki, bias_limit)
         s = filter.state
-        for i in range(250):
+        for i in range(90):
             if i % 5 == 0:
                 filter.set_bias(*(rng.choice((-limit, limit, 0)) for _ in range(3)))
                 s[1:5] = array("i", with_extreme_low_parts(rng, random_quaternion(rng), 15))
@@ -101,6 +146,20 @@ def test_nothing_leaves_32_bits_at_the_corners_of_the_accepted_range(checked):
                     s[mahony._IR + j] = (1 << s[mahony._KI_SHIFT]) - 1
                     s[mahony._WR + j] = 32767
             counts = extreme_counts(rng)
+            if i % 3 == 0:
+                # both errors at their largest, in the same direction, after many steps without a sample
+                field, e = extreme_field(rng, s[1:5])
+                up = turned_back(s[1:5], (-e[1], e[0], e[2] / 3))
+                norm = math.hypot(*up) or 1
+                counts[0:3] = array("h", [round(v / norm * 32000) for v in up])
+                counts[6:9] = array("h", field)
+                counts[10] = 3
+                s[mahony._MAG_AGE] = rng.choice((0, 1, 4, 1 << 29))
+            if i % 10 == 5:  # all of it on one axis
+                s[1:5] = array("i", [ONE, 0, 0, 0])
+                counts[6:9] = array("h", [0, rng.choice((-32766, 32766)), 0])
+                counts[10] = 3
+                s[mahony._MAG_AGE] = 1 << 29
             if i % 7 == 0:  # everything on one side: gyro and bias against each other on all axes
                 for j in range(3):
                     counts[3 + j] = -32768 if filter._bias[j] > 0 else 32767
@@ -137,6 +196,13 @@ def test_nothing_leaves_32_bits_in_the_kernels_at_their_own_limits(checked):
         if i % 5 == 0:
             counts[0], counts[1], counts[2] = rng.randint(-9, 9), rng.randint(-9, 9), 4
         fixmath.tilt(s, counts)
+        field, e = extreme_field(rng, s[1:5])
+        norm = math.hypot(*e) or 1
+        # the other error's largest, in the same direction
+        e = turned_back(s[1:5], [v / norm * ONE for v in e])
+        s[fixmath.E : fixmath.E + 3] = array("i", [int(v) for v in e])
+        counts[6:9] = array("h", field if i & 3 else extreme_counts(rng)[6:9])
+        fixmath.north(s, counts, rng.choice((1, 2, 5, 13, 61, fixmath.STEPS_MAX)))
         fixmath.euler(s[1:5], out, ("zyx", "zxy")[i & 1])
         fixmath.turn(s)
         assert abs(math.hypot(*s[1:5]) / ONE - 1) < 1e-4
@@ -144,12 +210,13 @@ def test_nothing_leaves_32_bits_in_the_kernels_at_their_own_limits(checked):
 
 def test_every_operation_of_every_viper_function_was_exercised(checked):
     """The two tests above leave nothing out. They run again here: in parallel they may have run in another process."""
-    test_nothing_leaves_32_bits_at_the_corners_of_the_accepted_range(checked)
+    test_nothing_leaves_32_bits_at_the_corners_of_the_accepted_range(checked, "Mahony9")
     test_nothing_leaves_32_bits_in_the_kernels_at_their_own_limits(checked)
     watch, _, _ = checked
     assert watch.missed() == []
     assert watch.functions == {
         "fixmath.tilt",
+        "fixmath.north",
         "fixmath.turn",
         "fixmath._euler",
         "mahony.update",

@@ -1,5 +1,5 @@
-# Integer kernels of the attitude filters: unit vectors, gravity, turning a quaternion, Euler
-# angles. Needs the viper emitter of MicroPython, or CPython with a stand-in `micropython` module.
+# Integer kernels of the attitude filters: gravity, north, turning a quaternion, Euler angles.
+# Needs the viper emitter of MicroPython, or CPython with a stand-in `micropython` module.
 # The part marked "tick" allocates nothing, raises nothing and uses no float; all of it gives the
 # same bits on every port.
 #
@@ -22,11 +22,14 @@ WR = const(12)  # 3: what rounding has left of it, 2**-46, 0..32767
 V = const(15)  # 3: a measured vector, scaled so that its length is 2**15..2**16
 VR = const(18)  # 1: 2**30 / that length, 16384..32768
 UP = const(19)  # 3: the estimated up (gravity's reaction) in the body, Q28
-E = const(22)  # 3: the attitude error as a rotation vector in the body, Q29
+E = const(22)  # 3: the attitude error as a rotation vector in the body, Q29; see north()
 LOW = const(25)  # 1: least squared length / 4 of the accelerometer's counts that is used, 4..2**28
 OWN = const(26)  # the filter's own words follow
 
 ONE = const(1 << 29)  # 1.0 in Q29
+
+MAG_LOW = const(64)  # least squared length / 4 of the magnetometer's counts that is used: 16 counts
+STEPS_MAX = const(253)  # the most steps that a magnetometer sample can stand for
 
 # pi to 16 digits, for set-up in integers: single-precision boards get the same gains bit for bit
 PI_NUM = 3141592653589793
@@ -44,7 +47,7 @@ def tilt(s: ptr32, counts: ptr16):
     squared length / 4 below LOW; V and UP then stay as they were.
 
     1/sqrt: the quadratic of least relative error (2.4 %) on [1/4, 1], then two Newton steps (1e-6,
-    less than the rounding of VR). The relative error of VR is below 1e-4 and acts as a gain, not as
+    less than the rounding of VR). The relative error of VR is below 1.5e-4 and acts as a gain, not as
     an offset.
     """
     s[E] = 0
@@ -116,6 +119,133 @@ def tilt(s: ptr32, counts: ptr16):
     q = x * h1 - y * h0 + ((x * l1 - y * l0 + 8192) >> 14)
     h3 = (q + 16384) >> 15
     s[E + 2] = h3 * r + (((q - (h3 << 15)) * r + 16384) >> 15)
+
+
+@micropython.viper
+def north(s: ptr32, counts: ptr16, steps: int) -> int:
+    """Add `steps` times the error of the magnetometer of counts to E -> what E is coarser by, 0..6.
+
+    steps: 1..STEPS_MAX. E becomes (E + steps e) / 2**shift in Q29, |E| < 4 then; shift is returned:
+    the least with steps + 3 <= 4 << shift. Or -1, with E as it was: a word is at full scale
+    (-32768, 32767), or the squared length / 4 is below MAG_LOW.
+
+    With m the unit field in the body, h = R m, b = (bx, 0, hz), bx = hypot(hx, hy) and w = R'b the
+    error is e = m x w. In the earth frame that is (hy hz, hz (bx - hx), -hy bx), and with
+    t = tan(heading error / 2) = hy / (bx + hx): hy (hz, hz t, -bx). So hy alone needs all of its 30
+    bits; a relative error of the rest (2e-4) acts as a gain, not as an offset. Only where hx < 0 is
+    bx - hx the better form of hy t.
+    """
+    x = ((counts[6] & 0xFFFF) ^ 0x8000) - 0x8000
+    y = ((counts[7] & 0xFFFF) ^ 0x8000) - 0x8000
+    z = ((counts[8] & 0xFFFF) ^ 0x8000) - 0x8000
+    n = (x * x >> 2) + (y * y >> 2) + (z * z >> 2)
+    full = x > 32766 or y > 32766 or z > 32766 or x < -32767 or y < -32767 or z < -32767
+    if full or n < MAG_LOW:
+        # nothing times a made-up field: a way out from here would be a jump too far for a Cortex-M0+
+        steps = 0
+        x = 64
+        y = 0
+        z = 0
+        n = 1024
+    down = 0
+    while steps + 3 > 4 << down:
+        down += 1
+    shift = 0
+    while n < 0x10000000:  # at most 11 times
+        n <<= 2
+        shift += 1
+    # m: the counts at a length of 2**15..2**16
+    x <<= shift
+    y <<= shift
+    z <<= shift
+    h0 = x >> 1
+    h1 = y >> 1
+    h2 = z >> 1
+    gain = 0x1FFFFFFF // ((h0 * h0 + h1 * h1 + h2 * h2) >> 14)  # 2**45 / |m|**2
+    k = 0
+    if s[PROBE] > 0:
+        k = 32
+    n = s[Q] << k >> k
+    h0 = (n + 16384) >> 15
+    l0 = n - (h0 << 15)
+    n = s[Q + 1] << k >> k
+    h1 = (n + 16384) >> 15
+    l1 = n - (h1 << 15)
+    n = s[Q + 2] << k >> k
+    h2 = (n + 16384) >> 15
+    l2 = n - (h2 << 15)
+    n = s[Q + 3] << k >> k
+    h3 = (n + 16384) >> 15
+    l3 = n - (h3 << 15)
+    # row 2 of R (west in the body), Q28, and py = 2**14 |m| hy, 14 bits of it at a time
+    u = ((h1 * h2 + h0 * h3) << 1) + ((h1 * l2 + l1 * h2 + h0 * l3 + l0 * h3 + 8192) >> 14)
+    v = h0 * h0 - h1 * h1 + h2 * h2 - h3 * h3
+    v += (h0 * l0 - h1 * l1 + h2 * l2 - h3 * l3 + 8192) >> 14
+    w = ((h2 * h3 - h0 * h1) << 1) + ((h2 * l3 + l2 * h3 - h0 * l1 - l0 * h1 + 8192) >> 14)
+    w0 = (u + 8192) >> 14
+    w1 = (v + 8192) >> 14
+    w2 = (w + 8192) >> 14
+    py = w0 * x + w1 * y + w2 * z
+    py += ((u - (w0 << 14)) * x + (v - (w1 << 14)) * y + (w - (w2 << 14)) * z + 8192) >> 14
+    # rows 1 and 3, Q14
+    u = h0 * h0 - h2 * h2
+    v = h1 * h1 - h3 * h3
+    n0 = (u + v + 8192) >> 14
+    u2 = (u - v + 8192) >> 14
+    u = h1 * h3
+    v = h0 * h2
+    n2 = (u + v + 4096) >> 13
+    u0 = (u - v + 4096) >> 13
+    n1 = (h1 * h2 - h0 * h3 + 4096) >> 13
+    u1 = (h2 * h3 + h0 * h1 + 4096) >> 13
+    px = n0 * x + n1 * y + n2 * z
+    # u = 2**30 hz / |m|, times steps / 2**down
+    u = ((u0 * x + u1 * y + u2 * z) >> 15) * gain >> 14
+    u = u * steps >> down
+    # b = 2**(shift - 1) |m| bx, 0.43..0.95 times 2**15: a line, then Heron twice
+    x = (px + 16384) >> 15
+    y = (py + 16384) >> 15
+    n = x * x + y * y
+    shift = 0
+    while n < 0xC000000 and shift < 13:
+        n <<= 2
+        shift += 1
+    x = px >> (15 - shift)
+    y = py >> (15 - shift)
+    n = x * x + y * y
+    b = ((n >> 15) * 21845 >> 15) + 11403
+    b = (b + n // b) >> 1
+    b = (b + n // b) >> 1
+    v = (b * gain >> 15) * steps >> down
+    # the error in the earth frame, as E will be
+    h = (py + 16384) >> 15
+    py -= h << 15
+    z = 0 - (((h * v + (py * v >> 15)) >> shift) << 1)
+    if x < 0:
+        y = (((b - x) >> 2) * u >> shift) << 2
+        x = h * u + (py * u >> 15)
+    else:
+        n = (y << 15) // (b + x)
+        x = h * u + (py * u >> 15)
+        h = (x + 16384) >> 15
+        y = h * n + ((x - (h << 15)) * n >> 15)
+    # and in the body
+    h0 = (x + 8192) >> 14
+    h1 = (y + 8192) >> 14
+    h2 = (z + 8192) >> 14
+    x -= h0 << 14
+    y -= h1 << 14
+    z -= h2 << 14
+    n = 1 << down >> 1
+    u = n0 * h0 + w0 * h1 + u0 * h2 + ((n0 * x + w0 * y + u0 * z + 8192) >> 14)
+    s[E] = (((s[E] << k >> k) + n) >> down) + u
+    u = n1 * h0 + w1 * h1 + u1 * h2 + ((n1 * x + w1 * y + u1 * z + 8192) >> 14)
+    s[E + 1] = (((s[E + 1] << k >> k) + n) >> down) + u
+    u = n2 * h0 + w2 * h1 + u2 * h2 + ((n2 * x + w2 * y + u2 * z + 8192) >> 14)
+    s[E + 2] = (((s[E + 2] << k >> k) + n) >> down) + u
+    if steps == 0:
+        down = -1
+    return down
 
 
 @micropython.viper
@@ -421,6 +551,26 @@ def level(x, y, z):
     pitch_c, pitch_s = _half(side, -x << 32, norm)
     roll_c, roll_s = _half(z << 32, y << 32, side) if side else (1, 0)
     return unit_quaternion(pitch_c * roll_c, pitch_c * roll_s, pitch_s * roll_c, -pitch_s * roll_s)
+
+
+def level_north(up, field):
+    """The attitude in which the body vector `up` points up and `field`'s horizontal part to x, north.
+
+    up, field: 3 ints each, neither 0 nor along the other. Returns (w, x, y, z) in Q29.
+    """
+    x, y, z = up
+    w, i, j, k = level(x, y, z)
+    # north and west of the field in the frame of level(), both times hypot(y, z) |up|
+    side = y * y + z * z
+    norm = isqrt((x * x + side) << 64)
+    if side:
+        north = (field[0] * side - x * (y * field[1] + z * field[2])) << 32
+        west = (z * field[1] - y * field[2]) * norm
+    else:  # level() has roll 0 there
+        north = -x * field[2] << 32
+        west = norm * field[1]
+    c, s = _half(north, -west, isqrt(north * north + west * west))
+    return unit_quaternion(c * w - s * k, c * i - s * j, c * j + s * i, c * k + s * w)
 
 
 def _half(c, s, r):

@@ -1,4 +1,5 @@
-# Mahony's attitude filter with a fixed step in 32-bit integers: sensor counts in, quaternion out.
+# Mahony's attitude filter with a fixed step in 32-bit integers, for six and for nine axes: sensor
+# counts in, quaternion out.
 # Needs fixmath.py and the viper emitter. update() is made for a hard interrupt: it allocates
 # nothing, raises nothing, uses no float, and gives the same bits on every port. docs/numerics.md
 # has the bounds.
@@ -8,7 +9,7 @@ from array import array
 
 import fixmath
 import micropython
-from fixmath import tilt, turn
+from fixmath import north, tilt, turn
 from micropython import const
 
 # the words of fixmath's kernels that are used here ...
@@ -34,11 +35,16 @@ _KI = const(48)  # ki dt**2 2**(I_SHIFT + 1) = KI / 2**(KI_SHIFT + 14)
 _KI_SHIFT = const(49)  # 1..29
 _I_SHIFT = const(50)  # 0..15
 _I_MAX = const(51)  # bound of |I|, below 2**30
-_WORDS = const(52)
+_MAG_MOST = const(52)  # a magnetometer sample stands for at most so many steps, 1..253; 0: six axes
+_MAG_AGE = const(53)  # steps since one was used, 0.._NEVER
+_WORDS = const(54)
 
 _BIAS_MAX = const(8192 * 256)  # 1/256 counts: 62 deg/s at +-250, 500 deg/s at +-2000 deg/s
 _W_MAX = const((1 << 31) - (1 << 16))  # 1 rad in Q31, less what fixmath.turn adds for rounding
 _LEAST_MANTISSA = const(64)  # a gain is held to better than 1 %
+_NEVER = const(0x3FFFFFFF)
+_MAG_LEAST_HZ = const(10)  # a slower magnetometer acts with less than its full weight
+_SEED_SINE = const(32)  # no heading from a field within asin(1/32), 1.8 deg, of the vertical
 
 
 class Mahony6:
@@ -87,7 +93,9 @@ class Mahony6:
         s[_PROBE] = -1
         s[_Q] = fixmath.ONE
         s[_LOW] = accel_lsb_per_g * accel_lsb_per_g >> 10  # (1/16 g)**2 / 4
-        _set_gains(s, self.rate, self.gyro_scale, kp, ki, bias_limit_dps)
+        s[_MAG_AGE] = _NEVER
+        references = self.AXES // 3 - 1
+        _set_gains(s, self.rate, self.gyro_scale, kp, ki, bias_limit_dps, references)
 
     # -- set-up and main loop
     def seed(self, counts):
@@ -197,7 +205,8 @@ class Mahony6:
 
         The feedback is left out when flags (word 10) has bit 0 clear (no fresh sample: the last
         gyro words go on) or bit 2 set (accelerometer at full scale), and below 1/16 g; the integral
-        then stands still and goes on being applied.
+        then stands still and goes on being applied. The magnetometer, where there is one, does not
+        depend on the accelerometer: it is used with the bits 0 and 1 set.
         """
         state = self._s
         tilt(state, counts)  # E
@@ -205,21 +214,36 @@ class Mahony6:
         # a kernel of its own: to call one costs as much as to do a third of its work.
         s = ptr32(state)
         c = ptr16(counts)
+        down = 0  # how much coarser than Q29 E is
+        most = s[_MAG_MOST]
+        if most:
+            n = s[_MAG_AGE]
+            if n < _NEVER:
+                n += 1
+            if c[10] & 3 == 3:
+                if n < most:
+                    most = n
+                down = int(north(state, counts, most))
+                if down < 0:
+                    down = 0
+                else:
+                    n = 0
+            s[_MAG_AGE] = n
         k = 0
         if s[_PROBE] > 0:
             k = 32
         gain = s[_KI]
         i = 0
         if gain:
-            shift = s[_KI_SHIFT]
+            shift = s[_KI_SHIFT] - down
             i_shift = s[_I_SHIFT]
             i_max = s[_I_MAX]
             while i < 3:
                 e = s[_E + i] << k >> k
                 h = (e + 8192) >> 14
-                a = h * gain + (((e - (h << 14)) * gain + 8192) >> 14) + s[_IR + i]
+                a = h * gain + (((e - (h << 14)) * gain + 8192) >> 14) + (s[_IR + i] >> down)
                 n = (s[_I + i] << k >> k) + (a >> shift)
-                s[_IR + i] = a - (a >> shift << shift)
+                s[_IR + i] = (a - (a >> shift << shift)) << down
                 if n > i_max:
                     n = i_max
                 elif n < 0 - i_max:
@@ -231,7 +255,7 @@ class Mahony6:
                 i += 1
         # three times the same: a loop with computed indices costs a third more
         gain = s[_KP]
-        shift = s[_KP_SHIFT]
+        shift = s[_KP_SHIFT] - down
         g = s[_G]
         g_rest = s[_GR]
         e = s[_E] << k >> k
@@ -261,6 +285,60 @@ class Mahony6:
         turn(state)
 
 
+class Mahony9(Mahony6):
+    """Mahony6 with a magnetometer (counts 6..8): yaw is the magnetic heading, x of the earth frame is north.
+
+    rate, gyro_scale, accel_lsb_per_g, bias_limit_dps: as for Mahony6. kp and ki act on the sum of
+    both errors, accel x up and mag x the field that the attitude makes of it (fixmath.north). A
+    heading error falls with the time constant 1 / (kp (1 - sin(dip))) in s: a steep field turns the
+    attitude rather about the horizontal, which the accelerometer undoes.
+
+    A magnetometer sample is used when flags (word 10) has bits 0 and 1 set, no word of it is at
+    full scale of int16 and it is 16 counts or longer; at all other times this is Mahony6, bit for
+    bit. The unit of its counts does not matter, their axes do: right-handed, as the
+    accelerometer's. It may come more slowly than the steps: its error then acts with the number of
+    steps since the one used last, so that the gain does not depend on its rate; but with no more
+    than are in 1/10 s, than 253, than make kp n dt 1/2, and than the numbers hold.
+
+    Raises ValueError like Mahony6; the ranges of kp are smaller where the gyro's own are large.
+
+    heading_seeded  True when the last seed() took the heading from the magnetometer
+    """
+
+    NAME = "mahony9"
+    AXES = 9
+
+    heading_seeded = False
+    update = Mahony6.update  # found at once: a look-up in the class above costs 400 instructions
+
+    def seed(self, counts):
+        """Mahony6.seed, with the heading from the magnetometer when flags (word 10) has bit 1 set.
+
+        It is 0 all the same where update() would not use the sample, or the field is within 1.8 deg
+        of the vertical: see `heading_seeded`. Returns True, or False when the accelerometer sample
+        is shorter than 1/16 g: then the attitude is the identity.
+        """
+        self.heading_seeded = False
+        if not Mahony6.seed(self, counts):
+            return False
+        up, field = tuple(counts[0:3]), tuple(counts[6:9])
+        usable = counts[10] & 2 and -32768 < min(field) and max(field) < 32767
+        length = _dot(field, field)
+        if usable and sum([v * v >> 2 for v in field]) >= fixmath.MAG_LOW:
+            # |up x field|**2
+            across = _dot(up, up) * length - _dot(up, field) ** 2
+            if across * _SEED_SINE**2 >= _dot(up, up) * length:
+                self._attitude(fixmath.level_north(up, field))
+                self._s[_MAG_AGE] = 0
+                self.heading_seeded = True
+        return True
+
+    @property
+    def mag_age(self):
+        """Steps since the magnetometer was used last; 0 when the last step did, 2**30 - 1 if none ever has."""
+        return self._s[_MAG_AGE]
+
+
 # ----------------------------------------------------------------------------- set-up: allocates
 def _ratio_of(value, name, unit_name):
     num, den = value if isinstance(value, (tuple, list)) else (value, 1)
@@ -275,7 +353,8 @@ def _ratio_of(value, name, unit_name):
 def _set_gains(s, rate, gyro_scale, kp, ki, bias_limit_dps, error_max=1):
     """Turn rate, scales and gains into the state's words, in integers throughout.
 
-    error_max: the most that |E| can be, which is 1 for each reference vector.
+    error_max: the most that |E| can be, which is 1 for each reference vector; with a second one it
+    is the least that is asked for, and sets how many steps a sample of that may stand for.
     Bounds: |W| < 1 rad with every axis of the gyro at full scale against a bias of 8192 counts, the
     error at its maximum and the integral at its limit; the gyro gain in 17 bits or more; 2 kp dt <
     1.
@@ -347,10 +426,23 @@ def _set_gains(s, rate, gyro_scale, kp, ki, bias_limit_dps, error_max=1):
     s[_KI_SHIFT] = ki_pair[1] - 14
     s[_I_SHIFT] = shift
     s[_I_MAX] = i_max
+    s[_MAG_MOST] = 0
+    if error_max > 1:
+        # E is coarser by fixmath.north's shift, and the gains' shifts are so much smaller meanwhile
+        finest = min(s[_KP_SHIFT], s[_KI_SHIFT] - 1)
+        steps = min((4 << finest) - 3, fixmath.STEPS_MAX, -(-num // (_MAG_LEAST_HZ * den)))
+        if s[_KP]:
+            unit = 1 << (s[_KP_SHIFT] + 14)  # 2 kp dt = KP / unit
+            steps = min(steps, unit // s[_KP], (_W_MAX - least) * unit // (s[_KP] << 29) - 1)
+        s[_MAG_MOST] = max(steps, 1)
     for i in range(4):
         s[_QR + i] = 16384
     for i in range(3):
         s[_WR + i] = 16384
+
+
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _times_root3(v):

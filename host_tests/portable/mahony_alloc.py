@@ -1,4 +1,5 @@
-# 10,000 updates and conversions with the heap locked, then again with the allocated bytes counted.
+# 10,000 updates and conversions of the six- and the nine-axis filter with the heap locked, then again
+# with the allocated bytes counted.
 # Arguments: [float | list]: also do something in every step that allocates, to show that it is
 # caught.
 
@@ -8,7 +9,7 @@ from array import array
 
 import fixmath
 import micropython
-from mahony import Mahony6
+from mahony import Mahony6, Mahony9
 
 UPDATES = 10000
 waste = sys.argv[1] if len(sys.argv) > 1 else ""
@@ -18,18 +19,22 @@ def row(*values):
     return array("h", values)
 
 
-# level, tilted, upside down, free fall, accelerometer and gyro at full scale, stale
+# level, tilted, upside down, free fall, accelerometer and gyro at full scale, stale; the magnetometer
+# fresh, not fresh, none, weak, strong, at full scale
 ROWS = (
-    row(0, 0, 4096, 10, -10, 5, 0, 0, 0, 0, 1),
-    row(2000, -3000, 1500, 3000, -2000, 500, 0, 0, 0, 0, 1),
-    row(-900, 100, -4000, -300, 20, 32767, 0, 0, 0, 0, 9),
-    row(0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1),
-    row(32767, -32768, 32767, -32768, 32767, -32768, 0, 0, 0, 0, 5),
-    row(32767, -32768, 32767, 32767, 32767, 32767, 0, 0, 0, 0, 1),
-    row(100, 200, 4000, 1000, -1000, 1000, 0, 0, 0, 0, 0),
+    row(0, 0, 4096, 10, -10, 5, 66, 10, -150, 0, 3),
+    row(2000, -3000, 1500, 3000, -2000, 500, 66, 10, -150, 0, 1),
+    row(-900, 100, -4000, -300, 20, 32767, 0, 0, 0, 0, 11),
+    row(0, 0, 0, 0, 0, 0, -16, 0, 0, 0, 3),
+    row(32767, -32768, 32767, -32768, 32767, -32768, 32766, 32766, -32767, 0, 7),
+    row(32767, -32768, 32767, 32767, 32767, 32767, 32767, 0, 0, 0, 3),
+    row(100, 200, 4000, 1000, -1000, 1000, -10, -70, 140, 0, 2),
 )
 filter = Mahony6(200, (82, 5), 4096, 1, 0.1)
-filter.set_bias(100, -200, 300)
+nine = Mahony9(1000, (82, 5), 4096, 1, 0.1)
+for f in (filter, nine):
+    f.set_bias(100, -200, 300)
+    f.seed(ROWS[0])
 quaternion = array("i", [0, 0, 0, 0])
 angles = array("i", [0, 0, 0])
 
@@ -38,6 +43,8 @@ def run(n):
     i = 0
     while n:
         filter.update(ROWS[i])
+        nine.update(ROWS[i])
+        nine.quaternion(quaternion)
         filter.quaternion(quaternion)
         filter.angles(angles)
         fixmath.euler(quaternion, angles, "zxy")
@@ -51,7 +58,6 @@ def run(n):
         n -= 1
 
 
-filter.seed(ROWS[0])
 run(7)
 micropython.heap_lock()
 try:

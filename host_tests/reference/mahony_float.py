@@ -1,8 +1,8 @@
 """Mahony's filter in double-precision floats: what lib/mahony.py is measured against.
 
 Plain Python without numpy; runs on CPython. It takes the integer filter's gains as they were
-quantised, and the same decisions (flags, the least accelerometer norm, the integral's limit), so
-that a comparison measures arithmetic alone.
+quantised, and the same decisions (flags, the least norms, the integral's limit, the steps that a
+magnetometer sample stands for), so that a comparison measures arithmetic alone.
 """
 
 import math
@@ -101,22 +101,28 @@ class MahonyFloat:
         norm = math.sqrt(sum(v * v for v in self.q))
         self.q = [v / norm for v in self.q]
 
+    def error(self, counts):
+        """The error that is fed back in this step, or None."""
+        ax, ay, az = counts[0], counts[1], counts[2]
+        q0, q1, q2, q3 = self.q
+        self.fed_back = counts[10] & 5 == 1 and quarter_square(ax, ay, az) >= self.accel_low
+        if not self.fed_back:
+            return None
+        norm = math.sqrt(ax * ax + ay * ay + az * az)
+        vx = 2 * (q1 * q3 - q0 * q2)
+        vy = 2 * (q0 * q1 + q2 * q3)
+        vz = q0 * q0 - q1 * q1 - q2 * q2 + q3 * q3
+        return ((ay * vz - az * vy) / norm, (az * vx - ax * vz) / norm, (ax * vy - ay * vx) / norm)
+
     def update(self, counts):
         """One step with 11 counts (ax ay az gx gy gz mx my mz temp flags), of any sequence of ints."""
-        ax, ay, az, gx, gy, gz = counts[0], counts[1], counts[2], counts[3], counts[4], counts[5]
+        gx, gy, gz = counts[3], counts[4], counts[5]
         q0, q1, q2, q3 = self.q
         b, i = self.bias, self.integral
         scale = self.gyro
         wx, wy, wz = gx * scale - b[0], gy * scale - b[1], gz * scale - b[2]
-        # the integer filter's own comparison, truncation of each square included
-        long_enough = (ax * ax >> 2) + (ay * ay >> 2) + (az * az >> 2) >= self.accel_low
-        self.fed_back = counts[10] & 5 == 1 and long_enough
-        if self.fed_back:
-            norm = math.sqrt(ax * ax + ay * ay + az * az)
-            vx = 2 * (q1 * q3 - q0 * q2)
-            vy = 2 * (q0 * q1 + q2 * q3)
-            vz = q0 * q0 - q1 * q1 - q2 * q2 + q3 * q3
-            e = ((ay * vz - az * vy) / norm, (az * vx - ax * vz) / norm, (ax * vy - ay * vx) / norm)
+        e = self.error(counts)
+        if e:
             gain, limit = self.ki * self.dt, self.integral_limit
             for j in range(3):
                 i[j] = max(-limit, min(limit, i[j] + gain * e[j]))
@@ -141,6 +147,68 @@ class MahonyFloat:
             )
         norm = math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
         self.q = [q0 / norm, q1 / norm, q2 / norm, q3 / norm]
+
+
+class Mahony9Float(MahonyFloat):
+    """The float twin of mahony.Mahony9; made by `like`.
+
+    The magnetometer's error is written as in the widespread code: the field in the earth frame, its
+    horizontal part turned to north, back in the body as w, and e = m x w.
+
+    mag_most  the most steps that a magnetometer sample stands for
+    mag_age   steps since the one used last
+    """
+
+    mag_most = 1
+    mag_age = math.inf
+
+    @classmethod
+    def like(cls, integer, **kw):
+        import mahony
+
+        twin = super().like(integer, **kw)
+        twin.mag_most = integer.state[mahony._MAG_MOST]
+        twin.mag_age = integer.mag_age
+        return twin
+
+    def error(self, counts):
+        e = super().error(counts)
+        self.mag_age += 1
+        field = counts[6], counts[7], counts[8]
+        if counts[10] & 3 != 3 or max(field) == 32767 or min(field) == -32768:
+            return e
+        if quarter_square(*field) < 64:
+            return e
+        steps = min(self.mag_age, self.mag_most)
+        self.mag_age = 0
+        return [
+            a + steps * b for a, b in zip(e or (0, 0, 0), self.field_error(*field), strict=True)
+        ]
+
+    def field_error(self, mx, my, mz):
+        """m x w of the field in any unit."""
+        q0, q1, q2, q3 = self.q
+        norm = math.sqrt(mx * mx + my * my + mz * mz)
+        mx, my, mz = mx / norm, my / norm, mz / norm
+        hx = 2 * (
+            mx * (0.5 - q2 * q2 - q3 * q3) + my * (q1 * q2 - q0 * q3) + mz * (q1 * q3 + q0 * q2)
+        )
+        hy = 2 * (
+            mx * (q1 * q2 + q0 * q3) + my * (0.5 - q1 * q1 - q3 * q3) + mz * (q2 * q3 - q0 * q1)
+        )
+        bz = 2 * (
+            mx * (q1 * q3 - q0 * q2) + my * (q2 * q3 + q0 * q1) + mz * (0.5 - q1 * q1 - q2 * q2)
+        )
+        bx = math.sqrt(hx * hx + hy * hy)
+        wx = 2 * (bx * (0.5 - q2 * q2 - q3 * q3) + bz * (q1 * q3 - q0 * q2))
+        wy = 2 * (bx * (q1 * q2 - q0 * q3) + bz * (q0 * q1 + q2 * q3))
+        wz = 2 * (bx * (q0 * q2 + q1 * q3) + bz * (0.5 - q1 * q1 - q2 * q2))
+        return my * wz - mz * wy, mz * wx - mx * wz, mx * wy - my * wx
+
+
+def quarter_square(x, y, z):
+    """The squared length / 4 that the integer filter compares, truncation of each square included."""
+    return (x * x >> 2) + (y * y >> 2) + (z * z >> 2)
 
 
 def angle_between(p, q):
