@@ -1,8 +1,13 @@
 """Debian's packages, fetched and unpacked without touching the system or needing root. Standard library only."""
 
+import contextlib
+import fcntl
+import lzma
 import re
 import shutil
 import subprocess
+import tarfile
+import tempfile
 from pathlib import Path
 
 SUITE = "trixie"  # Debian 13
@@ -15,7 +20,10 @@ class AptError(Exception):
 class Apt:
     """apt-get with a private state in the cache; only the mirror and the keys are the system's."""
 
-    def __init__(self, folder: Path, architectures: list[str]):
+    def __init__(
+        self, folder: Path, architectures: list[str], suite: str = SUITE, sources: bool = False
+    ):
+        """sources: True: source packages of the suite instead of binary ones."""
         for tool in ("apt-get", "apt-cache", "dpkg-deb"):
             if not shutil.which(tool):
                 raise AptError(f"{tool} is not here (not a Debian system?)")
@@ -25,8 +33,9 @@ class Apt:
         (folder / "status").touch()
         keyring = Path("/usr/share/keyrings/debian-archive-keyring.gpg")
         signed = f" signed-by={keyring}" if keyring.exists() else ""
+        options = f"arch={','.join(architectures)}{signed}"
         (folder / "sources.list").write_text(
-            f"deb [arch={','.join(architectures)}{signed}] {self._mirror()} {SUITE} main\n"
+            f"{'deb-src' if sources else 'deb'} [{options}] {self._mirror()} {suite} main\n"
         )
         settings = {
             "Dir::State": folder / "state",
@@ -76,9 +85,9 @@ class Apt:
         names = [line.strip() for line in listed.splitlines() if re.match(r"[a-z0-9]", line)]
         return sorted({n if ":" in n else f"{n}:{native}" for n in names})
 
-    def download(self, packages: list[str], step) -> None:
+    def download(self, packages: list[str], step, command=("download",)) -> None:
         """Fetch the packages into debs/; apt checks signatures and hashes. step(percent, text) tells how far it is."""
-        argv = ["apt-get", *self.options, "-o", "APT::Status-Fd=1", "download", *packages]
+        argv = ["apt-get", *self.options, "-o", "APT::Status-Fd=1", *command, *packages]
         with subprocess.Popen(
             argv,
             cwd=self.folder / "debs",
@@ -92,7 +101,7 @@ class Apt:
                     step(float(percent), text)
             errors = [line for line in apt.stderr if line.startswith("E:")]
         if apt.returncode:
-            raise AptError(f"apt-get download: {(errors or ['failed'])[0].strip()}")
+            raise AptError(f"apt-get {command[0]}: {(errors or ['failed'])[0].strip()}")
 
     def unpack(self, packages: list[str], root: Path) -> None:
         for package in packages:
@@ -106,3 +115,90 @@ class Apt:
                     subprocess.run(take, stdin=tar.stdout, check=True)
             else:
                 subprocess.run(["dpkg-deb", "-x", deb, root], check=True, capture_output=True)
+
+
+def source(
+    package: str, suite: str, into: Path, step=lambda percent, text: None, patched: bool = False
+) -> Path:
+    """Fetch a source package (name, or name=version) of a suite and unpack it -> into, an absolute path.
+
+    Where `into` exists it is the answer: nothing is fetched twice, and what is left of an interrupted run is not taken
+    for the whole. apt checks signature and hashes. dpkg-source is not needed: the folder holds what upstream released
+    (as Debian repacked it), in debian/ what Debian adds, and Debian's patches are applied only where patched is True
+    (that needs the program patch). step(percent, text) tells how far it is. Raises AptError, one line.
+    """
+    into = into.absolute()
+    into.parent.mkdir(parents=True, exist_ok=True)
+    with open(into.parent / f".{into.name}.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if into.exists():
+            return into
+        for left in into.parent.glob(f".{into.name}-unpacking-*"):  # by a run that was killed
+            shutil.rmtree(left, ignore_errors=True)
+        with tempfile.TemporaryDirectory(
+            dir=into.parent, prefix=f".{into.name}-unpacking-"
+        ) as work:
+            step(0, "package lists")
+            # sources are of no architecture; apt wants to hear one
+            apt = Apt(Path(work), ["amd64"], suite, sources=True)
+            apt.run("apt-get", "update")
+            apt.download([package], step, ("source", "--only-source", "--download-only"))
+            step(100, f"unpacking {package}")
+            tree = _unpack_source(apt.folder / "debs")
+            if patched:
+                _patch(tree)
+            tree.rename(into)
+    return into
+
+
+def _unpack_source(folder: Path) -> Path:
+    """Unpack the tar files of one source package that lie in a folder -> its tree."""
+    tree = folder / "tree"
+    archives = sorted(folder.glob("*.tar.*"), key=lambda path: ".orig.tar." not in path.name)
+    archives = [path for path in archives if path.suffix != ".asc"]
+    if not archives or ".dsc" not in {path.suffix for path in folder.iterdir()}:
+        raise AptError("apt-get source fetched no source package")
+    for archive in archives:
+        # name_version.orig.tar.xz, name_version.orig-component.tar.xz, name_version-revision.debian.tar.xz
+        component = re.search(r"\.orig-([^.]+)\.tar\.", archive.name)
+        debian = ".debian.tar." in archive.name
+        scratch = folder / "scratch"
+        scratch.mkdir()
+        try:
+            with tarfile.open(archive) as tar:
+                if hasattr(tarfile, "tar_filter"):
+                    tar.extractall(scratch, filter="tar")
+                else:
+                    tar.extractall(scratch)
+        except (OSError, EOFError, lzma.LZMAError, tarfile.TarError) as why:
+            raise AptError(f"{archive.name} cannot be unpacked: {why}") from None
+        inside = list(scratch.iterdir())
+        top = inside[0] if len(inside) == 1 and inside[0].is_dir() else scratch
+        place = tree / component.group(1) if component else tree / "debian" if debian else tree
+        shutil.rmtree(
+            place, ignore_errors=True
+        )  # an empty place of a component, upstream's debian/
+        top.rename(place)
+        with contextlib.suppress(FileNotFoundError):
+            shutil.rmtree(scratch)
+    return tree
+
+
+def _patch(tree: Path) -> None:
+    if not shutil.which("patch"):
+        raise AptError("patch is not here; install Debian's package patch")
+    series = tree / "debian/patches/series"
+    for line in series.read_text().splitlines() if series.exists() else []:
+        name = line.split("#")[0].strip()
+        if not name:
+            continue
+        done = subprocess.run(
+            ["patch", "-p1", "-s", "-f", "-i", series.parent / name.split()[0]],
+            cwd=tree,
+            capture_output=True,
+            text=True,
+        )
+        if done.returncode:
+            raise AptError(
+                f"Debian's {name} does not apply: {done.stdout.strip().splitlines()[:1]}"
+            )
