@@ -1,0 +1,71 @@
+# RoboMaster development board A (STM32F427IIH6): MPU6500 on SPI5, IST8310 on its auxiliary bus, OLED on SPI1.
+# Everything is on the board but the OLED; see README.md. What can be set besides is in firmware/config.py.
+
+import time
+
+import ssd1306
+import timing
+from auxiliary_bus import AuxiliaryBus
+from ist8310 import IST8310
+from machine import SPI, Pin
+from mpu6500 import MPU6500
+
+NAME = "RoboMaster board A"
+PLATFORM = "pyboard"  # sys.platform there
+RATE = 1000
+SENSOR_RATE_HZ = 1000
+DRIVE = "timer"
+FILTER = "mahony9"
+DISPLAY_SHARES_BUS = False  # SPI1 is the OLED's alone: the main program writes it
+
+# The frame of the MPU6500, as its data sheet draws it on the package, is the body's.
+IMU_AXES = ("x", "y", "z")
+# UNVERIFIED on silicon: nobody has yet run the axis check of README.md on this board; until then trust roll and pitch,
+# not yaw. Where it comes from: the vendor's own firmware for this board turns the magnetometer's words so
+# (RoboMaster/RoboRTS-Firmware, bsp/boards/drv_imu.c, mpu_get_data). It mirrors once, as it must: the IST8310's frame is
+# left-handed (PX4, IST8310.cpp; ArduPilot, AP_Compass_IST8310.cpp). The vendor's older example
+# (RoboMaster/DevelopmentBoard-Examples, Imu) has no map at all.
+MAG_AXES = ("y", "-x", "-z")
+
+# TIM7 has no outputs, so nothing on the board can want it; its callbacks are hard. TIM1, 2, 4, 5, 8 and 12 drive the
+# servo and buzzer connectors, TIM3 the heater; MicroPython takes TIM5 for servos and TIM6 for timed ADC and DAC.
+_TICK_TIMER = 7
+
+# SPI1 and SPI5 hang on APB2 (84 MHz) behind a power of two from 2 to 256: 1 MHz asked for is 656 kHz, 20 MHz is 10.5.
+_IMU_HZ = 1000000
+_OLED_HZ = 5250000  # the SSD1306 stands 10 MHz
+
+_imu_spi = SPI(5, baudrate=_IMU_HZ)
+_imu_select = Pin("PF6", Pin.OUT, value=1)
+_mag_reset = Pin("PE2", Pin.OUT, value=1)
+
+
+def sensor():
+    return MPU6500(_imu_spi, _imu_select)
+
+
+def magnetometer(imu):
+    # A processor's reset does not reset the chip; its pin does, low. Then it needs up to 50 ms.
+    _mag_reset(0)
+    time.sleep_ms(1)
+    _mag_reset(1)
+    time.sleep_ms(50)
+    return IST8310(AuxiliaryBus(imu))
+
+
+def display(chunk):
+    return ssd1306.SSD1306_SPI(
+        SPI(1, baudrate=_OLED_HZ),
+        dc=Pin("PB9", Pin.OUT, value=0),
+        rst=Pin("PB10", Pin.OUT, value=1),
+        chunk=chunk,
+    )
+
+
+def data_ready_pin():
+    # Only for DRIVE = "data_ready". From several teams' headers, not from the vendor's.
+    return Pin("PB8", Pin.IN)
+
+
+def make_tick(rate, callback):
+    return timing.make_tick(rate, callback, pyb_timer=_TICK_TIMER)
