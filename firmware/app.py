@@ -4,6 +4,7 @@
 import time
 from array import array
 
+import calibration
 import config
 import filters
 import fixmath
@@ -16,6 +17,7 @@ _FRAME_MS = const(100)
 _RATE_MS = const(1000)
 _LOST_MS = const(300)  # without a fresh sample the attitude is only carried on
 _RETRY_MS = const(1000)
+_HEADING_MS = const(300)  # the first magnetometer sample is waited for as long
 _GUARD_HZ = const(50)
 
 # At rest: what the gyro and accelerometer of an MPU6050 may move in a window, and how far a bias may lie (PS 6.1:
@@ -31,14 +33,17 @@ _REST_READS_HZ = const(200)  # at least, with the slowest bus
 class App:
     """One board's application: run() never returns.
 
-    tick, filter, imu, display, ticker are there once start() is through; bias_known says whether the gyro's bias
-    was measured.
+    tick, filter, imu, mag, calibration, display, ticker are there once start() is through (mag is None on a board
+    without a magnetometer); bias_known says whether the gyro's bias was measured.
     """
 
     def __init__(self, board):
         self.board = board
         self.config = config.Config(board)
         self.imu = None
+        self.mag = None
+        self._own_mag = None  # the same, where it is read by itself and not with the IMU's sample
+        self.calibration = None
         self.filter = None
         self.tick = None
         self.ticker = None
@@ -48,11 +53,13 @@ class App:
         self.angles = array("i", [0] * 3)  # roll, pitch, yaw in millidegrees
         self.rate_hz = 0
         self._snapshot = array("i", [0] * ticks.SNAPSHOT_WORDS)
+        self._notes = []  # what start-up could not do, for the display
         self._page = 0
         self._pages = None
-        self._frame_at = self._rate_at = self._page_at = self._fresh_at = time.ticks_ms()
+        now = time.ticks_ms()
+        self._frame_at = self._rate_at = self._page_at = self._fresh_at = self._mag_at = now
         self._rate_steps = 0
-        self._last_fresh = 0
+        self._last_fresh = self._last_mag = 0
         self._reported = 0
 
     # ------------------------------------------------------------------------------------ start
@@ -80,12 +87,14 @@ class App:
         if self.config.DRIVE != "timer" and not self.config.EXTERNAL_CLOCK:
             # every packet or data-ready edge is one step, so the chip's rate is the rate
             rate = imu.sample_rate
+        self._open_magnetometer()
+        self._load_calibration()
         self.filter = filters.make(self.config.FILTER, rate, imu, self.config.GAINS)
         if self.config.MEASURE_BIAS:
-            self.say("Keep still", "measuring the", "gyro's bias")
+            self.say("Keep still", "measuring the", "gyro's bias", *self._notes)
             self.bias_known = self._measure_bias()
-            if not self.bias_known:
-                print("bias: never at rest, going on without (marked B? on the display)")
+        if not self.bias_known:
+            self._use_stored_bias()
         self._seed()
         self._start_tick(rate)
         print(
@@ -124,9 +133,68 @@ class App:
         self.imu = imu
         return True
 
+    def _open_magnetometer(self):
+        """The board's magnetometer; without it, or until it answers, the attitude comes from six axes."""
+        if not hasattr(self.board, "magnetometer"):
+            return
+        imu, config = self.imu, self.config
+        self.mag = mag = self.board.magnetometer(imu)
+        self._own_mag = mag if hasattr(mag, "read") else None
+        rate = config.RATE if config.EXTERNAL_CLOCK else imu.sample_rate
+        if self._own_mag is None and config.DRIVE == "timer" and rate != config.RATE:
+            raise ValueError(
+                "the magnetometer's sample comes with one of the IMU's and none may go by unread: "
+                "SENSOR_RATE_HZ has to be RATE"
+            )
+        try:
+            mag.configure(rate_hz=config.MAG_RATE_HZ, sample_rate=rate)
+            print("magnetometer: %s, %d/%d Hz" % ((mag.chip,) + mag.sample_rate))
+        except OSError as why:
+            print("magnetometer:", why)
+            self._notes.append("no magnetometer")
+            mag.attach()  # should it answer yet, the tick finds it and sets it up
+
+    def _load_calibration(self):
+        imu, config = self.imu, self.config
+        self.calibration = calibration.Calibration(
+            config.IMU_AXES, config.MAG_AXES, imu.accel_lsb_per_g, imu.gyro_scale
+        )
+        try:
+            self.calibration.load(config.CALIBRATION, imu.chip, self.board.NAME)
+            print("calibration:", config.CALIBRATION)
+        except calibration.CalibrationError as why:
+            print("calibration: %s; going on with defaults" % why)
+            self._notes.append(why.title)
+
+    @property
+    def counts(self):
+        """The newest sample as the filter gets it: calibrated, in the body's frame."""
+        return self.imu.counts if self.calibration.identity else self.calibration.counts
+
+    def _sample(self):
+        """Read a sample while no tick does -> its flags."""
+        flags = self.imu.read()
+        if self._own_mag is not None:
+            flags = self._own_mag.read(self.imu.counts)
+        if not self.calibration.identity:
+            self.calibration.apply(self.imu.counts)
+        return flags
+
+    def _use_stored_bias(self):
+        """The gyro's bias of the calibration file, where there is one."""
+        bias = self.calibration.gyro_bias()
+        if bias is None:
+            if self.config.MEASURE_BIAS:
+                print("bias: never at rest, going on without (marked B? on the display)")
+            return
+        self.filter.set_bias(*bias)
+        self.bias_known = True
+        print("bias: from", self.config.CALIBRATION)
+
     def _measure_bias(self):
         """Mean of the gyro over a window at rest -> True; False when it never rested."""
         imu = self.imu
+        counts = self.counts
         num, den = imu.gyro_scale
         gyro_most = _REST_GYRO_DPS * num // den
         bias_most = _BIAS_MOST_DPS * num // den
@@ -141,10 +209,10 @@ class App:
             n = 0
             start = time.ticks_ms()
             while time.ticks_diff(time.ticks_ms(), start) < _REST_WINDOW_MS:
-                if imu.read() & 1:
+                if self._sample() & 1:
                     n += 1
                     for i in range(6):
-                        c = imu.counts[i]
+                        c = counts[i]
                         total[i] += c
                         low[i] = min(low[i], c)
                         high[i] = max(high[i], c)
@@ -162,15 +230,22 @@ class App:
                 self.filter.set_bias(*mean)
                 print("bias: %s mdeg/s" % ([m * 1000 * den // (256 * num) for m in mean],))
                 return True
-            self.say("Keep still", "it moves;", "trying again")
+            self.say("Keep still", "it moves;", "trying again", *self._notes)
         return False
 
     def _seed(self):
-        """The attitude from a first sample; from level when none comes (the tick's feedback does the rest)."""
-        for _ in range(100):
-            if self.imu.read() & 1 and self.filter.seed(self.imu.counts):
+        """The attitude from a first sample, heading included where a magnetometer has one; from level when none comes
+        (the tick's feedback does the rest)."""
+        start = time.ticks_ms()
+        passed = 0
+        while passed < 2 * _HEADING_MS:
+            flags = self._sample()
+            passed = time.ticks_diff(time.ticks_ms(), start)
+            # one sample in several has the magnetometer's: none may go by unread
+            ready = self.mag is None or self.filter.AXES < 9 or flags & 2 or passed > _HEADING_MS
+            if flags & 1 and ready and self.filter.seed(self.counts):
                 return
-            time.sleep_ms(2)
+            time.sleep_us(100)
         print("seed: no usable accelerometer sample, starting level")
 
     def _start_tick(self, rate):
@@ -188,6 +263,8 @@ class App:
             display,
             self.config.DISPLAY_CHUNK,
             ticks.FOLLOW_TIMER if self.config.DRIVE == "timer" else ticks.FOLLOW_CHIP,
+            None if self.calibration.identity else self.calibration,
+            self._own_mag,
         )
         if display is not None:
             self._flush()  # the bus is the tick's from here on
@@ -216,6 +293,9 @@ class App:
         if tick.fresh != self._last_fresh:
             self._last_fresh = tick.fresh
             self._fresh_at = now
+        if self.mag is not None and self.mag.fresh != self._last_mag:
+            self._last_mag = self.mag.fresh
+            self._mag_at = now
         passed = time.ticks_diff(now, self._rate_at)
         if passed >= _RATE_MS:
             self._rate_at = now
@@ -238,6 +318,8 @@ class App:
         n = imu.errors + imu.resets + imu.fifo_overflows + tick.missed + tick.crashes
         if self.display is not None:
             n += self.display.errors
+        if self.mag is not None:
+            n += self.mag.errors + self.mag.resets
         return n
 
     def _report(self):
@@ -257,6 +339,10 @@ class App:
         flags = 0 if self.bias_known else pages.BIAS_UNKNOWN
         if time.ticks_diff(now, self._fresh_at) >= _LOST_MS:
             flags |= pages.SENSOR_LOST
+        if self.filter.AXES == 9 and (
+            self.mag is None or time.ticks_diff(now, self._mag_at) >= _LOST_MS
+        ):
+            flags |= pages.MAG_LOST
         self._pages.draw(
             self._page,
             self.angles,

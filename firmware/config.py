@@ -15,6 +15,13 @@ DEFAULTS = {
     "ACCEL_RANGE_G": 8,
     "GYRO_RANGE_DPS": 2000,
     "DLPF": 2,
+    # How the chips sit on the board: body x, y, z (forward, left, up) each as an axis of the chip, "x", "-y", ...
+    "IMU_AXES": ("x", "y", "z"),
+    "MAG_AXES": ("x", "y", "z"),
+    # Of the magnetometer, where board.py has one.
+    "MAG_RATE_HZ": 100,
+    # Corrections and biases, see calibration.py; made by `upright calibrate`.
+    "CALIBRATION": "calibration.json",
     # The filter by its name in filters.py, and its own arguments.
     "FILTER": "mahony6",
     "GAINS": {"kp": 0.5, "ki": 0.0},
@@ -39,7 +46,7 @@ class Config:
     def __init__(self, board):
         for name in dir(board):
             setting = name.isupper() and name[0] != "_" and not callable(getattr(board, name))
-            if setting and name != "NAME" and name not in DEFAULTS:
+            if setting and name not in ("NAME", "PLATFORM") and name not in DEFAULTS:
                 raise ValueError("board.py sets %s, which is no setting; see config.py" % name)
         for name in DEFAULTS:
             setattr(self, name, getattr(board, name, DEFAULTS[name]))

@@ -15,6 +15,7 @@ HORIZON = const(1)
 # flags of draw()
 BIAS_UNKNOWN = const(1)  # the gyro's bias was not measured: the yaw drifts
 SENSOR_LOST = const(2)  # no fresh sample: the angles are old
+MAG_LOST = const(4)  # nine axes were asked for, but there is no magnetometer now: the yaw drifts
 
 _PANEL = const(42)  # columns right of the horizon, for the figures
 _LADDER = const(10)  # degrees between the rungs of the pitch ladder
@@ -100,7 +101,7 @@ class Pages:
 
         page: NUMBERS or HORIZON. angles: array('i') of roll, pitch, yaw in millidegrees, within
         +-180000. rate_hz: samples per second. temperature: centidegrees Celsius. faults: a count.
-        flags: BIAS_UNKNOWN, SENSOR_LOST.
+        flags: BIAS_UNKNOWN, SENSOR_LOST, MAG_LOST.
         """
         self._display.fill(BLACK)
         if page == HORIZON:
@@ -127,9 +128,10 @@ class Pages:
             d.text("°C", x, y)
             d.text("F", 90, y)
             d.number(faults if faults < 999 else 999, 96, y)
-        if flags & BIAS_UNKNOWN:
+        if flags & (BIAS_UNKNOWN | MAG_LOST):
             d.fill_rect(115, y, 13, 8, WHITE)
-            d.text("B?", 116, y, SMALL, BLACK)
+            unknown = "B?" if not flags & MAG_LOST else "BM" if flags & BIAS_UNKNOWN else "M?"
+            d.text(unknown, 116, y, SMALL, BLACK)
 
     # -------------------------------------------------------------------------- numbers
 

@@ -1,5 +1,6 @@
 # The tick: sample, filter, published state, a bounded piece of the display. Runs in a hard interrupt.
-# Needs a driver of lib/ (read, health, counts), a filter of lib/ (update, state) and viper. Every port.
+# Needs a driver of lib/ (read, health, counts), a filter of lib/ (update, state) and viper; where the board has them, a
+# calibration (apply, counts) and a magnetometer on a bus of the tick (read). Every port.
 
 from array import array
 from time import ticks_add, ticks_diff, ticks_us
@@ -22,10 +23,14 @@ FOLLOW_TIMER = const(10)
 # The chip's clock on the data-ready line may be off by some percent (2 %: 0.64 of a period behind).
 FOLLOW_CHIP = const(5)
 
-_FRESH = const(1)
+_FRESH = const(1)  # bit 0 of the flags: accelerometer and gyro
+_ANY_FRESH = const(3)  # bit 1: magnetometer
 _WRAP = const(0x3FFFFFFF)  # counters stay small ints
 # Steps between two looks at a configuration register while samples come in: a power of 2
 _HEALTH_EVERY = const(8)
+# What health() answers while it writes a chip's registers back; and how many of them a slow tick does at once
+_REPAIRING = const(2)
+_REPAIRS = const(8)
 # Steps made up for at once: bounds the tick; past it the last rate says nothing
 _MOST_COASTS = const(16)
 
@@ -58,22 +63,37 @@ def _publish(state: ptr32, q: ptr32, counts: ptr16) -> int:
 
 
 class Tick:
-    """One step a sample: read -> update -> publish, then at most `chunk` bytes of the display's new content.
+    """One step a sample: read -> calibrate -> update -> publish, then at most `chunk` bytes of the new display.
 
     `on_sample` and `on_fifo` are the callbacks (made once here, since fetching a bound method allocates): on_sample
     for a timer or the chip's data-ready line, on_fifo for a timer that drains the FIFO. They never raise: what
     goes wrong is counted in `missed` (ticks that never came, made up for by coasting), `crashes` (with the last one
     in `error`), and in the driver's and display's own counters.
 
-    period_us  the sample period, to notice ticks that never came; 0 with the FIFO, whose packets say it
-    follow     how readily the expected time follows the ticks' own clock: by late / 2**follow a tick
-    display    given only where the tick owns the display's bus
+    period_us    the sample period, to notice ticks that never came; 0 with the FIFO, whose packets say it
+    follow       how readily the expected time follows the ticks' own clock: by late / 2**follow a tick
+    display      given only where the tick owns the display's bus
+    calibration  None: the filter gets the driver's counts as they are
+    mag          a magnetometer that is read by itself, its bus being the tick's; None where it comes with the sample
     """
 
-    def __init__(self, imu, filter, period_us, display=None, chunk=32, follow=FOLLOW_TIMER):
+    def __init__(
+        self,
+        imu,
+        filter,
+        period_us,
+        display=None,
+        chunk=32,
+        follow=FOLLOW_TIMER,
+        calibration=None,
+        mag=None,
+    ):
         self._imu = imu
         self._filter = filter
-        self._counts = imu.counts
+        self._raw = imu.counts
+        self._calibration = calibration
+        self._counts = imu.counts if calibration is None else calibration.counts
+        self._mag = mag
         self._display = display
         self._chunk = chunk
         self._period = period_us
@@ -100,6 +120,8 @@ class Tick:
         try:
             if self._on_time():
                 self._imu.read()
+                if self._mag is not None:
+                    self._mag.read(self._raw)
                 self._step()
                 if self._display is not None:
                     self._display.flush_step(self._chunk)
@@ -117,9 +139,11 @@ class Tick:
             imu = self._imu
             n = imu.fifo_poll()
             if n == 0:
-                imu.health()
+                self._look_after()
             while n > 0:
                 imu.fifo_next()  # a packet that is withheld after a reset is a step all the same: it coasts
+                if n == 1 and self._mag is not None:
+                    self._mag.read(self._raw)
                 self._step()
                 n -= 1
             if self._display is not None:
@@ -138,13 +162,20 @@ class Tick:
         try:
             if self._state[_STEPS] == self._seen:
                 self._imu.read()
-                self._imu.health()
+                self._look_after()
                 if self._display is not None:  # which is to show that the sensor is lost
                     self._display.flush_step(self._chunk)
             self._seen = self._state[_STEPS]
         except Exception as error:
             self._crashed(error)
         self._inside = False
+
+    @micropython.native
+    def _look_after(self):
+        """Health of the chip from a tick that comes seldom: a repair is not to take a tick for each register."""
+        n = _REPAIRS
+        while n > 0 and self._imu.health() == _REPAIRING:
+            n -= 1
 
     def _crashed(self, error):
         self.crashes = (self.crashes + 1) & _WRAP
@@ -184,7 +215,7 @@ class Tick:
         if lost > _MOST_COASTS:
             lost = _MOST_COASTS
         self._made_up = lost
-        self._counts[10] &= ~_FRESH
+        self._counts[10] &= ~_ANY_FRESH
         while lost > 0:
             self._filter.update(self._counts)
             lost -= 1
@@ -192,6 +223,8 @@ class Tick:
     @micropython.native
     def _step(self):
         counts = self._counts
+        if self._calibration is not None:
+            self._calibration.apply(self._raw)
         self._filter.update(counts)
         if _publish(self._state, self._q, counts):
             self._imu.health()

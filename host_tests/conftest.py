@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections import namedtuple
 from pathlib import Path
 
 import hypothesis
@@ -12,7 +13,7 @@ for folder in ("boards/sim", "firmware", "lib", "host_tests", "host_tests/sim", 
 
 import micropython  # noqa: E402, F401  (the shim: it prepares `time` before anything of lib/ is imported)
 import pytest  # noqa: E402
-from upright import runtimes, trials  # noqa: E402
+from upright import oled, runtimes, simulate, trials  # noqa: E402
 
 PORTABLE = Path(__file__).parent / "portable"
 
@@ -71,5 +72,36 @@ def portable():
         done = runtimes.run(name, PORTABLE / script, args, timeout=timeout)
         assert done.returncode == 0, f"{script} on {name}:\n{done.stdout}\n{done.stderr}"
         return done.stdout
+
+    return run
+
+
+Boot = namedtuple("Boot", "result lines picture rows q29 times flags")
+
+
+@pytest.fixture
+def boot_board(tmp_path):
+    """boot_board(runtime=None, flash=None, **config) -> Boot: the firmware run on a simulated board, to its end.
+
+    config: that of host_tests/sim/run_firmware.py. lines: the console; picture: the display's last, as rows;
+    for each step the world's row, the attitude (Q29), its time in us, and its sample's flags.
+    """
+
+    def run(runtime=None, flash=None, **config):
+        lines, frames = [], []
+
+        def event(kind, fields):
+            if kind == "console":
+                lines.append(fields[0])
+            elif kind == "frame":
+                frames.append(bytes.fromhex(fields[1]))
+
+        out = tmp_path / "steps"
+        config = {"seconds": 4, "frame_ms": 100, "out": str(out)} | config
+        result = simulate.run(
+            runtime or simulate.best_runtime(), simulate.FIRMWARE, config, event, flash
+        )
+        picture = oled.rows_of_frame(frames[-1]) if frames else None
+        return Boot(result, lines, picture, *simulate.read_steps(out), *simulate.read_flags(out))
 
     return run

@@ -5,7 +5,7 @@ Every run is a process of its own on a runtime; faults are put in at their simul
 
 import numpy as np
 import pytest
-from upright import demo, oled, scoring, simulate
+from upright import demo, scoring, simulate
 
 SECOND = 1000000
 
@@ -22,24 +22,11 @@ def world(tmp_path_factory):
 
 
 @pytest.fixture
-def boot(world, tmp_path):
+def boot(boot_board, world):
     """boot(**config) -> (result, console lines, last picture as rows, world rows, attitudes Q29)."""
 
     def run(runtime=None, **config):
-        lines, frames = [], []
-
-        def event(kind, fields):
-            if kind == "console":
-                lines.append(fields[0])
-            elif kind == "frame":
-                frames.append(bytes.fromhex(fields[1]))
-
-        out = tmp_path / "steps"
-        config = {"world": str(world[0]), "seconds": 4, "frame_ms": 100, "out": str(out)} | config
-        result = simulate.run(runtime or simulate.best_runtime(), simulate.FIRMWARE, config, event)
-        rows, q29 = simulate.read_steps(out)
-        picture = oled.rows_of_frame(frames[-1]) if frames else None
-        return result, lines, picture, rows, q29
+        return boot_board(runtime, **({"world": str(world[0])} | config))[:5]
 
     return run
 
@@ -55,7 +42,8 @@ def healthy(result):
 def error_deg(world, rows, q29):
     """Inclination and aligned total RMSE against the truth."""
     motion = world[1]
-    score = scoring.score(rows / 1000, q29 / scoring.ONE, motion.t, motion.q_true)
+    once = scoring.once(rows)
+    score = scoring.score(rows[once] / 1000, q29[once] / scoring.ONE, motion.t, motion.q_true)
     return score.inclination, score.aligned_total
 
 

@@ -165,6 +165,21 @@ def test_another_bus_is_not_cut(i2c, bus):
     assert (bus.cuts, other.cuts, other.transfers) == (0, 0, 1)
 
 
+def test_soft_callbacks_run_while_the_main_program_sleeps():
+    at = []
+    machine.Timer(0, period=10, callback=lambda t: at.append(kernel.now()))
+    time.sleep_ms(35)
+    assert at == [10000, 20000, 30000]
+    assert kernel.now() == 35000
+
+
+def test_a_numbered_timer_has_soft_callbacks_only():
+    with pytest.raises(ValueError, match="hard"):
+        machine.Timer(0, period=10, hard=True, callback=print)
+    with pytest.raises(ValueError):
+        machine.Timer(4)
+
+
 def test_a_soft_callback_waits_for_the_transfer_to_end(i2c, bus):
     at = []
     machine.Timer(period=1, mode=machine.Timer.ONE_SHOT, callback=lambda t: at.append(bus.busy))

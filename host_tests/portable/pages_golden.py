@@ -100,6 +100,8 @@ def every_page(bench, tag):
     bench.page("horizon_inverted_" + tag, pages.HORIZON, (-178000, -5000, 90000))
     bench.page("horizon_up_" + tag, pages.HORIZON, (3000, -89000, 0))
     bench.page("lost_" + tag, pages.NUMBERS, (1000, 2000, 3000), 200, 3652, 12, 3)
+    bench.page("no_mag_" + tag, pages.NUMBERS, (1000, 2000, 3000), 1000, 3652, 12, 4)
+    bench.page("neither_" + tag, pages.HORIZON, LEVEL, 1000, 3652, 12, 5)
     bench.pages.message(
         "No MPU6050 at 0x68", "check wiring: SDA GP4, SCL GP5, VCC 3.3 V, GND", "retrying"
     )

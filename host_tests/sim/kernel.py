@@ -189,9 +189,15 @@ def _main_turn():
 
 
 def sleep_us(us):
-    """time.sleep_us in the main program; in a callback it holds everything up, as on a board."""
+    """time.sleep_us in the main program, with soft callbacks meanwhile; in a callback it holds everything up, as on a
+    board."""
     enter()
-    advance(us)
+    end = _now + us
+    if not _in_irq and not _in_soft and not _busy:
+        while next_due() < end:
+            advance_to(max(_now, next_due()))
+    if _now < end:
+        advance_to(end)
     leave()
 
 

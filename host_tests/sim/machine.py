@@ -198,18 +198,19 @@ class SoftSPI:
         miso=None,
     ):
         self._bus = _spi_bus(("pins", _number(sck), _number(mosi)))
+        self._clock = _Clock(0)
+        self._hz = self._polarity = self._phase = 0
         self.init(baudrate, polarity=polarity, phase=phase)
 
     def init(self, baudrate=None, *, polarity=None, phase=None, bits=8, firstbit=0):
-        kernel.enter()
+        # allocates nothing, as on boards: a driver finds out by calling it with the heap locked
         if baudrate is not None:
             self._hz = baudrate
-            self._clock = _Clock(1000000000 // baudrate)
+            self._clock.unit_ns = 1000000000 // baudrate
         if polarity is not None:
             self._polarity = polarity
         if phase is not None:
             self._phase = phase
-        kernel.leave()
 
     def deinit(self):
         pass
@@ -278,6 +279,8 @@ class SPI(SoftSPI):
         miso=None,
     ):
         self._bus = _spi_bus(id)
+        self._clock = _Clock(0)
+        self._hz = self._polarity = self._phase = 0
         self.init(baudrate, polarity=polarity, phase=phase)
 
 
@@ -373,20 +376,24 @@ class Pin:
 
 # ---------------------------------------------------------------- timers
 class Timer:
-    """As on rp2 from MicroPython 1.26 on: any number of them, `hard` honoured, microsecond resolution from `freq`."""
+    """As on rp2 from MicroPython 1.26 on: any number of them, `hard` honoured, microsecond resolution from `freq`. The
+    numbers 0 to 3 are esp32's, whose callbacks are soft only."""
 
     ONE_SHOT = 0
     PERIODIC = 1
 
     def __init__(self, id=-1, **options):
-        if id != -1:
+        if not -1 <= id <= 3:
             raise ValueError("Timer doesn't exist")
+        self._soft_only = id >= 0
         self._irq = None
         if options:
             self.init(**options)
 
     def init(self, *, mode=1, period=-1, freq=None, tick_hz=1000, callback=None, hard=False):
         self.deinit()
+        if hard and self._soft_only:
+            raise ValueError("hard Timers are not implemented")
         if freq is not None:
             self._period = int(1000000 / freq)
         elif period >= 0:
@@ -521,7 +528,7 @@ def wire_spi(bus_id, chip, cs=None, dc=None, rst=None):
 
         _wire(dc).listeners.append(set_dc)
     if rst is not None:
-        _wire(rst).listeners.append(chip.reset_pin)
+        wire_reset(rst, chip)
     return bus
 
 
@@ -531,6 +538,11 @@ def wire_pin(pin, chip):
     wire.chip = chip
     wire.level = chip.int_level
     kernel.add_source(wire)
+
+
+def wire_reset(pin, chip):
+    """A pin is the chip's reset input."""
+    _wire(pin).listeners.append(chip.reset_pin)
 
 
 def power_on(cause=PWRON_RESET):

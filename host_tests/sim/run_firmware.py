@@ -9,22 +9,24 @@ from binascii import hexlify
 
 import kernel
 import machine
-from chips.mpu6050 import MPU6050Chip
-from chips.ssd1306 import SSD1306Chip
 from world import StillWorld, World
+
+import boards
 
 CONFIG = {
     "world": None,  # an .imu file; None: at rest for ever
+    "board_name": "sim",  # folder in boards/
     "board": {},  # what board.py says otherwise
     "seconds": 10,  # of simulated time
     "frame_ms": 0,  # 0: no pictures; else the display's every so many ms
-    "out": None,  # a file for the attitude after every step: world row, then 4 int32 (Q29)
-    "imu": True,  # False: no sensor on the bus
-    "who_am_i": 0x68,
+    "out": None,  # a file for the state after every step, 7 int32: world row, attitude (4, Q29), flags, time in us
+    "imu": True,  # False: no sensor on the bus; likewise mag and display
+    "mag": True,
     "display": True,
+    "who_am_i": None,  # another identity for the IMU
     "irq_cost_us": 0,  # what the tick's code takes, beside its bus time
     "twin": None,  # "main_writes_shared_bus": what the firmware must not do, to show that it would be noticed
-    "faults": [],  # [at_us, "imu" or "display" or "bus", method, arguments...]: what goes wrong, and when
+    "faults": [],  # [at_us, "imu", "mag", "display" or "bus", method, arguments...]: what goes wrong, and when
 }
 
 
@@ -76,9 +78,10 @@ class Recorder:
         self._file = open(path, "wb")
         self._world = world
         self._chip = chip
-        self._row = array("i", [0] * 5)
+        self._row = array("i", [0] * 7)
         self._q = array("i", [0] * 4)
         self._steps = 0
+        self._mag = 0
         self.main = {}
 
     def after_irq(self):
@@ -90,6 +93,12 @@ class Recorder:
         self._row[0] = self._world.index_at(self._chip.sample_us)
         for i in range(4):
             self._row[1 + i] = self._q[i]
+        flags = app.counts[10]
+        if app.mag and app.mag.fresh != self._mag:
+            self._mag = app.mag.fresh
+            flags |= 2  # with the FIFO it may have come with any packet of this tick
+        self._row[5] = flags
+        self._row[6] = kernel.now()
         self._file.write(self._row)
 
     def close(self):
@@ -103,28 +112,22 @@ def main():
     machine.power_on()
     world = World(config["world"]) if config["world"] else StillWorld()
     world.start(0)
-    chip = MPU6050Chip(world, who_am_i=config["who_am_i"])
-    oled = SSD1306Chip()
-    buses = [machine.I2C(0)._bus, machine.I2C(1)._bus]
-    if config["imu"]:
-        machine.wire_i2c(0, chip)
-        machine.wire_pin(6, chip)
-    if config["display"]:
-        machine.wire_i2c(0 if config["board"].get("DISPLAY_SHARES_BUS", True) else 1, oled)
-    parts = {"imu": chip, "display": oled, "bus": buses[0]}
-    kernel.add_source(Faults(config["faults"], parts))
-    if config["frame_ms"]:
-        kernel.add_source(Frames(oled, config["frame_ms"]))
-    recorder = Recorder(config["out"], world, chip) if config["out"] else None
-    if recorder:
-        kernel.after_irq = recorder.after_irq
-    kernel.irq_cost_us = config["irq_cost_us"]
-    kernel.stop_at(int(config["seconds"] * 1000000))
 
     import board
 
     for name, value in config["board"].items():
         setattr(board, name, tuple(value) if isinstance(value, list) else value)
+    parts = boards.wire(config["board_name"], board, world, config)
+    bus = parts.buses[0]
+    faulty = {"imu": parts.imu, "mag": parts.mag, "display": parts.display, "bus": bus}
+    kernel.add_source(Faults(config["faults"], faulty))
+    if config["frame_ms"]:
+        kernel.add_source(Frames(parts.display, config["frame_ms"]))
+    recorder = Recorder(config["out"], world, parts.imu) if config["out"] else None
+    if recorder:
+        kernel.after_irq = recorder.after_irq
+    kernel.irq_cost_us = config["irq_cost_us"]
+    kernel.stop_at(int(config["seconds"] * 1000000))
     if config["twin"] == "main_writes_shared_bus":
         spoil_display_ownership()
     program = {"__name__": "__main__"}
@@ -137,7 +140,7 @@ def main():
         pass
     except kernel.Reset as reset:
         print("reset, cause", reset.args[0])
-    finish(program.get("application"), recorder, buses, oled)
+    finish(program.get("application"), recorder, parts)
 
 
 def spoil_display_ownership():
@@ -166,13 +169,14 @@ def execute(name, namespace):
     raise OSError("no %s on the path" % name)
 
 
-def finish(app, recorder, buses, oled):
+def finish(app, recorder, parts):
+    buses = parts.buses
     result = {
         "ended_us": kernel.now(),
         "irqs": kernel.irq_count,
         "cuts": sum([bus.cuts for bus in buses]),
         "bus_bytes": [bus.bytes for bus in buses],
-        "display_misuse": oled.errors,
+        "display_misuse": parts.display.errors,
         "uncaught": len(kernel.uncaught),
         "heap_checked": sys.implementation.name == "micropython",
         "started": False,
@@ -193,6 +197,12 @@ def finish(app, recorder, buses, oled):
         result["ticker"] = app.ticker.what
         result["display_errors"] = app.display.errors if app.display else None
         result["chip"] = imu.chip
+        result["filter"] = app.filter.NAME
+        result["axes"] = app.filter.AXES
+        if app.mag:
+            mag = app.mag
+            for name in ("fresh", "stale", "saturated", "errors", "resets"):
+                result["mag_" + name] = getattr(mag, name)
     if recorder:
         recorder.close()
     print("\tresult", json.dumps(result))

@@ -6,25 +6,30 @@ import json
 import sys
 from array import array
 
+import calibration
 import filters
 import kernel
 import machine
 import tick as ticks
-from chips.mpu6050 import MPU6050Chip
-from mpu6050 import MPU6050
 from world import World
+
+import boards
 
 CONFIG = {
     "world": "",  # the .imu file
     "filter": "mahony6",
     "gains": {},
-    "direct": False,  # True: counts straight into the filter; False: chip model, registers, driver and tick
+    "board_name": "sim",  # the board whose chips it goes through
+    "direct": False,  # True: counts straight into the filter; False: chip models, registers, drivers and tick
+    "mag": False,  # the rows have magnetometer counts
     "rows": None,  # at most so many samples
     "out": "",
 }
 
 _PROGRESS_EVERY = 1000
 _FRESH = 1
+_FRESH_MAG = 2
+_MAG_HZ = 160  # a little less than the IST8310 can measure with its average of 16 (6 ms each)
 
 
 class Recorder:
@@ -56,12 +61,12 @@ def _range(allowed, wanted, what):
 
 
 def through_chip(config, world, rows):
-    """Every sample through the chip model's registers, the driver and the tick, on the data-ready line."""
+    """Every sample through the chip models' registers, the drivers and the tick, on the data-ready line."""
     machine.power_on()
-    chip = MPU6050Chip(world)
-    bus = machine.wire_i2c(0, chip)
-    machine.wire_pin(6, chip)
-    imu = MPU6050(machine.I2C(0, scl=machine.Pin(5), sda=machine.Pin(4), freq=400000))
+    import board
+
+    parts = boards.wire(config["board_name"], board, world, {})
+    imu = board.sensor()
     gyro = tuple(world.gyro_scale)
     imu.configure(
         accel_range_g=32768 // world.accel_lsb_per_g,
@@ -72,11 +77,26 @@ def through_chip(config, world, rows):
     imu.configure_interrupt()
     num, den = world.rate
     filter = filters.make(config["filter"], world.rate, imu, config["gains"])
-    kernel.advance(2000)
-    imu.read()  # until it is started the world stands still at row 0
-    filter.seed(imu.counts)
+    calibrated, counts = None, imu.counts
+    if parts.mag:
+        mag = board.magnetometer(imu)
+        mag.configure(rate_hz=_MAG_HZ, sample_rate=world.rate)
+        calibrated = calibration.Calibration(
+            board.IMU_AXES, board.MAG_AXES, imu.accel_lsb_per_g, imu.gyro_scale
+        )
+        counts = calibrated.counts
+    wanted = _FRESH | _FRESH_MAG if parts.mag else _FRESH
+    flags = 0
+    for _ in range(40):  # until it is started the world stands still at row 0
+        kernel.advance(1000)
+        flags = imu.read()
+        if calibrated:
+            calibrated.apply(imu.counts)
+        if flags & wanted == wanted:
+            break
+    filter.seed(counts)
     period_us = (2000000 * den + num) // (2 * num)
-    tick = ticks.Tick(imu, filter, period_us, follow=ticks.FOLLOW_CHIP)
+    tick = ticks.Tick(imu, filter, period_us, follow=ticks.FOLLOW_CHIP, calibration=calibrated)
     recorder = Recorder(config["out"], filter, rows)
 
     def after_tick():
@@ -85,25 +105,29 @@ def through_chip(config, world, rows):
 
     kernel.after_irq = after_tick
     world.start(kernel.now() + 2000)
-    chip.poll(kernel.now())  # from now on the trial is its sample clock
+    parts.imu.poll(kernel.now())  # from now on the trial is its sample clock
     kernel.changed()
-    pin = machine.Pin(6)
+    pin = board.data_ready_pin()
     pin.irq(tick.on_sample, trigger=machine.Pin.IRQ_RISING, hard=True)
     end = kernel.now() + 2000 + world.time_us(rows) + 1000
     while recorder.rows < rows and kernel.now() < end:
         kernel.idle()
     recorder.close()
-    return {
+    result = {
         "rows": recorder.rows,
         "fresh": tick.fresh,
         "missed": tick.missed,
         "crashes": tick.crashes,
         "errors": imu.errors,
         "resets": imu.resets,
-        "cuts": bus.cuts,
+        "cuts": parts.buses[0].cuts,
         "uncaught": len(kernel.uncaught),
         "error": repr(tick.error) if tick.error else None,
     }
+    if parts.mag:
+        result["mag_fresh"] = mag.fresh
+        result["mag_errors"] = mag.errors
+    return result
 
 
 class Scales:
@@ -121,7 +145,7 @@ def straight(config, world, rows):
     recorder = Recorder(config["out"], filter, rows)
     for k in range(rows):
         world.load(k, counts)
-        flags = _FRESH
+        flags = _FRESH | _FRESH_MAG if config["mag"] else _FRESH
         for i in range(6):
             if counts[i] == 32767 or counts[i] == -32768:
                 flags |= 4 if i < 3 else 8

@@ -31,10 +31,16 @@ class Source:
     t_true: np.ndarray | None
     q_true: np.ndarray | None
     movement: np.ndarray | None = None
+    board_name: str = "sim"
     board: dict = field(default_factory=dict)
 
 
-def motion_source(name: str, seconds: float | None) -> Source:
+def boards() -> list[str]:
+    """The folders of boards/."""
+    return sorted(folder.name for folder in paths.BOARDS.iterdir() if folder.is_dir())
+
+
+def motion_source(name: str, seconds: float | None, board_name: str = "sim") -> Source:
     """A synthetic motion with the errors of a typical MPU6050. Raises ValueError for an unknown name."""
     sys.path.insert(0, str(paths.SIM))
     import motions
@@ -43,10 +49,12 @@ def motion_source(name: str, seconds: float | None) -> Source:
     if name not in motions.MOTIONS:
         raise ValueError(f"unknown motion {name!r}; there are {', '.join(motions.MOTIONS)}")
     motion = motions.render(name, rate=(WORLD_HZ, 1), seconds=seconds)
-    return Source(name, seconds, motion.write, motion.rate, motion.t, motion.q_true)
+    return Source(
+        name, seconds, motion.write, motion.rate, motion.t, motion.q_true, board_name=board_name
+    )
 
 
-def trial_source(path: Path, seconds: float | None) -> Source:
+def trial_source(path: Path, seconds: float | None, board_name: str = "sim") -> Source:
     """A recorded trial: its samples are the chip's samples, so the data-ready line drives the tick."""
     trial = trials.load(path)
     rows = trial.rows(seconds)
@@ -59,7 +67,7 @@ def trial_source(path: Path, seconds: float | None) -> Source:
         "GYRO_RANGE_DPS": trial.gyro_range_dps,
     }
     truth = (trial.t_gt, trial.q_true(), trial.movement) if trial.has_truth else (None, None, None)
-    return Source(trial.name, rows * den / num, trial.write, trial.rate, *truth, board)
+    return Source(trial.name, rows * den / num, trial.write, trial.rate, *truth, board_name, board)
 
 
 @dataclass
@@ -95,6 +103,7 @@ def run(source: Source, runtime: str, on_frame=None, on_console=None, **config) 
             "seconds": source.seconds,
             "frame_ms": FRAME_MS,
             "out": str(out),
+            "board_name": source.board_name,
             "board": source.board,
         } | config
         result = simulate.run(runtime, simulate.FIRMWARE, config, event)
@@ -105,7 +114,7 @@ def run(source: Source, runtime: str, on_frame=None, on_console=None, **config) 
 def _score(source: Source, rows, q29):
     if source.q_true is None or not len(rows):
         return None
-    first = np.concatenate([[True], np.diff(rows) > 0])  # a sample that two ticks saw counts once
+    first = scoring.once(rows)
     num, den = source.rate
     t = rows[first] * den / num
     slack = 0.5 * den / num
@@ -122,12 +131,16 @@ def summary(outcome: Outcome) -> list[str]:
     lines = []
     s = outcome.score
     if s and s.samples:
+        north = r["axes"] == 9
+        heading, total = (s.heading, s.total) if north else (s.aligned_heading, s.aligned_total)
         lines.append(
-            f"error against the truth (RMSE): inclination {s.inclination:.2f} deg, heading {s.aligned_heading:.2f} deg,"
-            f" total {s.aligned_total:.2f} deg"
+            f"{r['filter']}, error against the truth (RMSE): inclination {s.inclination:.2f} deg,"
+            f" heading {heading:.2f} deg, total {total:.2f} deg"
         )
         lines.append(
-            "   (heading after the best constant offset: six axes do not know where north is)"
+            "   (heading against the true north)"
+            if north
+            else "   (heading after the best constant offset: six axes do not know where north is)"
         )
     elif s:
         lines.append("no truth in this span: nothing to compare with")
@@ -135,6 +148,10 @@ def summary(outcome: Outcome) -> list[str]:
         f"ticks {r['steps']} ({r['fresh']} with a fresh sample), missed {r['missed']}, exceptions {r['crashes']},"
         f" bus errors {r['errors']}, transfers cut {r['cuts']}"
     )
+    if "mag_fresh" in r:
+        lines.append(
+            f"magnetometer samples {r['mag_fresh']}, overdue {r['mag_stale']}, bus errors {r['mag_errors']}"
+        )
     heap = (
         f"0 bytes, the heap was locked in all {r['irqs']} interrupts"
         if r["heap_checked"] and not r["crashes"] and not r["uncaught"]

@@ -19,6 +19,11 @@ class Replay:
     score: scoring.Score | None
 
 
+def board_for(filter_name: str) -> str:
+    """The simulated board that a filter's samples come from: with a magnetometer for those of nine axes."""
+    return "robomaster_a" if "9" in filter_name else "sim"
+
+
 def replay(
     trial: trials.Trial,
     filter_name: str = "mahony6",
@@ -38,6 +43,8 @@ def replay(
         config = {
             "world": str(world),
             "filter": filter_name,
+            "board_name": board_for(filter_name),
+            "mag": trial.mag_uT_per_lsb is not None,
             "gains": gains or {},
             "direct": direct,
             "out": str(out),
@@ -49,7 +56,7 @@ def replay(
 
         result = simulate.run(runtime, simulate.REPLAY, config, event)
         q29 = simulate.read_attitudes(out)
-    faults = {k: v for k, v in result.items() if k not in ("rows", "fresh") and v}
+    faults = {k: v for k, v in result.items() if k not in ("rows", "fresh", "mag_fresh") and v}
     if len(q29) != rows or result["fresh"] != rows or faults:
         raise simulate.SimulationError(
             f"{result['fresh']} of {rows} samples reached the filter fresh, {len(q29)} steps; {faults}"

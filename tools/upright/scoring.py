@@ -58,6 +58,11 @@ class Score:
         return "\n".join(self.lines())
 
 
+def once(rows) -> np.ndarray:
+    """A mask (n,) of the steps whose sample, a row of the world, no earlier step has seen."""
+    return np.concatenate([[True], np.diff(rows) > 0])
+
+
 def score(t, q, t_true, q_true, movement=None, slack=0.0) -> Score:
     """Compare the attitudes q (n, 4) at the times t (n,) with q_true (m, 4) at t_true (m,).
 

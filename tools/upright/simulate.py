@@ -26,9 +26,10 @@ def best_runtime() -> str:
         return "cpython"
 
 
-def run(runtime: str, script: Path, config: dict, on_event=None) -> dict:
+def run(runtime: str, script: Path, config: dict, on_event=None, flash: Path | None = None) -> dict:
     """Run a script of host_tests/sim with its configuration; -> its result.
 
+    flash: the folder that is the board's file system, where it keeps its calibration; None: an empty one.
     on_event(kind, fields) is called for every line: kind is "console" (fields: [line]) or the first word of a line
     that the script meant for the host ("frame", "time", "at"), with the other words in fields.
     Raises SimulationError, and runtimes.Unavailable.
@@ -36,13 +37,21 @@ def run(runtime: str, script: Path, config: dict, on_event=None) -> dict:
     result, said = None, []
     with tempfile.TemporaryDirectory() as folder:
         # In a file, since an argument of more than 255 bytes is too long for MicroPython.
-        told = Path(folder) / "config.json"
+        told = Path(folder) / "config"
         told.write_text(json.dumps(config))
-        argv, environment = runtimes.command(runtime, script, [told])
+        argv, environment = runtimes.command(
+            runtime, script, [told], config.get("board_name", "sim")
+        )
         with (
             open(Path(folder) / "errors", "w+") as errors,
             subprocess.Popen(
-                argv, env=environment, stdout=subprocess.PIPE, stderr=errors, text=True, bufsize=1
+                argv,
+                env=environment,
+                cwd=flash or folder,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                text=True,
+                bufsize=1,
             ) as process,
         ):
             try:
@@ -77,5 +86,15 @@ def read_attitudes(path: Path) -> np.ndarray:
 
 def read_steps(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """What run_firmware.py wrote -> (world row of each step (n,), attitudes int32 (n, 4), Q29)."""
-    rows = np.fromfile(path, "<i4").reshape(-1, 5)
-    return rows[:, 0], rows[:, 1:]
+    steps = _steps(path)
+    return steps[:, 0], steps[:, 1:5]
+
+
+def read_flags(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """What run_firmware.py wrote -> (time of each step in us (n,), flags of its sample (n,))."""
+    steps = _steps(path)
+    return steps[:, 6], steps[:, 5]
+
+
+def _steps(path: Path) -> np.ndarray:
+    return np.fromfile(path, "<i4").reshape(-1, 7)

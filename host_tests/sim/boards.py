@@ -1,0 +1,76 @@
+# What is soldered to or plugged into each simulated board: chip models on the mock's buses and pins, by the folder's
+# name in boards/. Portable. A new board has its wiring here, one function.
+
+import machine
+from chips.mpu6050 import MPU6050Chip
+from chips.ssd1306 import SSD1306Chip
+
+# I2C boards: the bus of sensor and display, and the pin of INT
+_I2C = {
+    "sim": (0, 6),
+    "pico": (0, 6),
+    "pico2": (0, 6),
+    "esp32": (0, 19),
+    "pyboard": (1, "X1"),
+    "weact_f411_blackpill": (1, "PB0"),
+}
+
+
+class Parts:
+    """imu, mag (None where there is none), display: chip models; buses: the sensor's first, then the display's."""
+
+    def __init__(self, imu, mag, display, buses):
+        self.imu = imu
+        self.mag = mag
+        self.display = display
+        self.buses = buses
+
+
+def _i2c_board(name, board, world, options):
+    """MPU6050 and SSD1306 on one bus, or the display on the next."""
+    bus, interrupt = _I2C[name]
+    imu = MPU6050Chip(world, who_am_i=options.get("who_am_i") or 0x68)
+    display = SSD1306Chip()
+    if options.get("imu", True):
+        machine.wire_i2c(bus, imu)
+        machine.wire_pin(interrupt, imu)
+    if options.get("display", True):
+        shared = getattr(board, "DISPLAY_SHARES_BUS", True)
+        machine.wire_i2c(bus if shared else bus + 1, display)
+    return Parts(imu, None, display, [machine.I2C(bus)._bus, machine.I2C(bus + 1)._bus])
+
+
+def _robomaster_a(name, board, world, options):
+    """MPU6500 on SPI5 with an IST8310 on its auxiliary bus; SSD1306 on SPI1 without chip select."""
+    from chips.ist8310 import IST8310Chip
+    from chips.mpu6500 import MPU6500Chip
+
+    imu = MPU6500Chip(world, who_am_i=options.get("who_am_i") or 0x70)
+    mag = IST8310Chip(world, axes=board.MAG_AXES)
+    display = SSD1306Chip()
+    if options.get("mag", True):
+        imu.aux.append(mag)
+        machine.wire_reset("PE2", mag)
+    if options.get("imu", True):
+        machine.wire_spi(5, imu, cs="PF6")
+        machine.wire_pin("PB8", imu)
+    if options.get("display", True):
+        machine.wire_spi(1, display, dc="PB9", rst="PB10")
+    return Parts(imu, mag, display, [machine.SPI(5)._bus, machine.SPI(1)._bus])
+
+
+BOARDS = {"robomaster_a": _robomaster_a}
+BOARDS.update({name: _i2c_board for name in _I2C})
+
+
+def wire(name, board, world, options):
+    """Wire the simulated parts of boards/<name> -> Parts.
+
+    board: its board.py, already imported. options: who_am_i (None: the part that belongs there), and imu, mag,
+    display: False where the part is missing.
+    """
+    if name not in BOARDS:
+        raise ValueError(
+            "no simulated wiring for the board %r; there is %s" % (name, sorted(BOARDS))
+        )
+    return BOARDS[name](name, board, world, options)
