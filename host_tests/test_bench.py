@@ -6,7 +6,7 @@ import sys
 import pytest
 from conftest import PORTABLE, require
 from fixmath import euler
-from mahony import Mahony6
+from mahony import Mahony6, Mahony9
 from upright import bench
 
 
@@ -56,19 +56,25 @@ def expected(monkeypatch):
     monkeypatch.setattr(sys, "path", list(sys.path))
     spec.loader.exec_module(steps)
 
-    def run(samples):
-        filter = Mahony6(200, (82, 5), 4096, steps.KP, steps.KI)
-        filter.seed(steps.ROWS[0])
-        for counts in samples(steps.ROWS):
+    def run(samples, kind=Mahony6, rows=steps.ROWS):
+        filter = kind(200, (82, 5), 4096, steps.KP, steps.KI)
+        filter.seed(rows[0])
+        for counts in samples(rows):
             filter.update(counts)
         return filter
 
     by_turns = run(lambda rows: [rows[i & 15] for i in range(40)])
     angles = [0, 0, 0]
     euler(by_turns.state[by_turns.QUATERNION :], angles)
+    nine = run(lambda rows: [rows[i & 15] for i in range(40)], Mahony9, steps.ROWS_9)
     same = run(lambda rows: [rows[3]] * 40)
+    # body x y z is y -x z of the IMU, x y -z of the magnetometer
+    ax, ay, az, gx, gy, gz = steps.ROWS_9[7][:6]
+    mx, my, mz = steps.ROWS_9[0][6:9]
     return {
         "filter": list(by_turns.state[by_turns.QUATERNION :][:4]),
+        "filter9": list(nine.state[nine.QUATERNION :][:4]),
+        "calibration": [ay, -ax, az, gy, -gx, gz, mx, my, -mz, -521, 1],
         "euler": angles,
         "read": list(steps.ROWS[3]),
         "tick": [*same.state[same.QUATERNION :][:4], 40, 40, 0, 0],

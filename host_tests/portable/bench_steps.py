@@ -24,10 +24,11 @@ except ImportError:
 sys.path.append(__file__.rsplit("/", 1)[0] if "/" in __file__ else ".")
 
 from float_mahony import FloatMahony
-from mahony import Mahony6
+from mahony import Mahony6, Mahony9
 
 FILTERS_ONLY = sys.argv[3:] == ["filters"]  # a trace is slow, its start too
 if not FILTERS_ONLY:
+    from calibration import Calibration
     from mpu6050 import MPU6050
     from ssd1306 import SSD1306_I2C
     from tick import Tick
@@ -57,6 +58,13 @@ def samples():
 
 
 ROWS = samples()
+# with a magnetometer that has a new measurement in every 8th sample
+ROWS_9 = tuple(
+    [
+        array("h", list(ROWS[k][:6]) + [82, 5 * k, -141, -521, 1 if k & 7 else 3])
+        for k in range(len(ROWS))
+    ]
+)
 
 
 # ------------------------------------------------------------------------------------------ the bus
@@ -108,6 +116,7 @@ for _i in range(3):
 put_word(0x41, ROWS[3][9])
 
 filter = Mahony6(RATE, GYRO_SCALE, ACCEL_LSB_PER_G, KP, KI)
+filter_9 = Mahony9(RATE, GYRO_SCALE, ACCEL_LSB_PER_G, KP, KI)
 tick_filter = Mahony6(RATE, GYRO_SCALE, ACCEL_LSB_PER_G, KP, KI)
 floats = FloatMahony(RATE, GYRO_SCALE[0] / GYRO_SCALE[1], KP, KI)
 angles = array("i", [0, 0, 0])
@@ -120,6 +129,7 @@ if not FILTERS_ONLY:
     imu = MPU6050(bus)
     imu.configure(8, 2000, sample_rate_hz=RATE)
     imu.read()
+    turned = Calibration(("y", "-x", "z"), ("x", "y", "-z"), ACCEL_LSB_PER_G, GYRO_SCALE)
     display_bus.writeto = quick_write
     display = SSD1306_I2C(display_bus, refresh=False)
     display.begin()
@@ -136,6 +146,8 @@ def start():
     for f in (filter, tick_filter):
         f.set_quaternion(1, 0, 0, 0)
         f.seed(ROWS[0])
+    filter_9.set_quaternion(1, 0, 0, 0)
+    filter_9.seed(ROWS_9[0])
     floats.q0, floats.q1, floats.q2, floats.q3 = filter.quaternion_floats()
 
 
@@ -172,6 +184,20 @@ def loop_filter(n):
     i = 0
     while i < n:
         filter.update(ROWS[i & 15])
+        i += 1
+
+
+def loop_filter_9(n):
+    i = 0
+    while i < n:
+        filter_9.update(ROWS_9[i & 15])
+        i += 1
+
+
+def loop_calibration(n):
+    i = 0
+    while i < n:
+        turned.apply(ROWS_9[i & 15])
         i += 1
 
 
@@ -227,6 +253,8 @@ PARTS = (
     ("bus_write", loop_bus_write),
     ("read", loop_read),
     ("filter", loop_filter),
+    ("filter9", loop_filter_9),
+    ("calibration", loop_calibration),
     ("float", loop_float),
     ("display", loop_display),
     ("euler", loop_euler),
@@ -244,6 +272,9 @@ def check(n):
     q = array("i", [0, 0, 0, 0])
     filter.quaternion(q)
     print("filter", *q)
+    filter_9.quaternion(q)
+    print("filter9", *q)
+    print("calibration", *turned.counts)
     print("euler", *angles)
     print("read", *imu.counts)
     tick_filter.quaternion(q)

@@ -28,6 +28,8 @@ LEAST_RATIO = 10  # instructions of the float filter to those of the integer one
 PARTS = {
     "read": "sensor read",
     "filter": "filter update",
+    "filter9": "filter update, nine axes",
+    "calibration": "calibration",
     "display": "display chunk, 32 bytes",
     "tick": "whole tick",
     "euler": "Euler angles",
