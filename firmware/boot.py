@@ -1,6 +1,14 @@
-# Runs first on the board: room for an exception raised in a hard interrupt, where nothing can be allocated.
+# Runs first on the board: finishes an interrupted installation, and makes room for an exception raised in a hard
+# interrupt, where nothing can be allocated.
 
 import micropython
+
+try:
+    import update
+
+    update.finish()
+except ImportError:
+    pass  # copied by hand, without it
 
 if hasattr(
     micropython, "alloc_emergency_exception_buf"

@@ -38,6 +38,7 @@ def test_links_lead_somewhere(page):
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(paths.ROOT)))
 def test_commands_exist(page):
     commands = {command.name for command in cli.app.registered_commands}
+    commands |= {group.name for group in cli.app.registered_groups}
     text = page.read_text()
     named = re.findall(r"`(?:\.venv/bin/)?upright ([a-z]+)", text)
     assert set(named) <= commands

@@ -7,6 +7,7 @@ from machine import I2C, Pin
 from mpu6050 import MPU6050
 
 NAME = "Raspberry Pi Pico"
+PLATFORM = "rp2"  # sys.platform there
 SENSOR_RATE_HZ = 1000
 
 # A stuck bus costs a tick at most this long (us).

@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from upright import __version__, bench, runtimes
+from upright import __version__, bench, calibrate, doctor, flash, packages, runtimes, wiring
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, rich_markup_mode="rich")
 console = Console()
@@ -64,6 +64,11 @@ def exec_file(
 
 
 bench.register(app)
+calibrate.register(app)
+packages.register(app)
+flash.register(app)
+doctor.register(app)
+wiring.register(app)
 
 _RUNTIME = "cpython, unix, unix32 or arm"
 
@@ -83,6 +88,7 @@ def _positive(seconds: float | None):
 def demo_command(
     trial: Path = typer.Option(None, help="Feed this recorded trial (.npz) through the chip."),
     motion: str = typer.Option("demo", help="Synthetic motion, when there is no --trial."),
+    board: str = typer.Option("sim", help="The board to simulate, a folder of boards/."),
     headless: bool = typer.Option(
         False, help="No live display: progress, the last picture, the figures."
     ),
@@ -98,7 +104,13 @@ def demo_command(
     from upright import demo, simulate, trials
 
     try:
-        source = demo.trial_source(trial, seconds) if trial else demo.motion_source(motion, seconds)
+        if board not in demo.boards():
+            raise ValueError(f"unknown board {board!r}; there are {', '.join(demo.boards())}")
+        source = (
+            demo.trial_source(trial, seconds, board)
+            if trial
+            else demo.motion_source(motion, seconds, board)
+        )
         runtime = runtime or simulate.best_runtime()
         outcome = demo.show(source, runtime, headless, speed, console)
         for line in demo.summary(outcome):

@@ -1,0 +1,32 @@
+# Raspberry Pi Pico 2 (RP2350), MicroPython 1.26 or newer for hard timer interrupts; see README.md for the wiring.
+# What can be set besides is in firmware/config.py.
+
+import ssd1306
+import timing
+from machine import I2C, Pin
+from mpu6050 import MPU6050
+
+NAME = "Raspberry Pi Pico 2"
+PLATFORM = "rp2"  # sys.platform there
+SENSOR_RATE_HZ = 1000
+
+# A stuck bus costs a tick at most this long (us).
+_TIMEOUT_US = 3000
+
+_i2c = I2C(0, scl=Pin(5), sda=Pin(4), freq=400000, timeout=_TIMEOUT_US)
+
+
+def sensor():
+    return MPU6050(_i2c)
+
+
+def display(chunk):
+    return ssd1306.SSD1306_I2C(_i2c, chunk=chunk)
+
+
+def data_ready_pin():
+    return Pin(6, Pin.IN)
+
+
+def make_tick(rate, callback):
+    return timing.make_tick(rate, callback)

@@ -1,0 +1,32 @@
+# WeAct Black Pill (STM32F411CE), MicroPython's WEACT_F411_BLACKPILL; see README.md for the wiring.
+# What can be set besides is in firmware/config.py.
+
+import ssd1306
+import timing
+from machine import I2C, Pin
+from mpu6050 import MPU6050
+
+NAME = "WeAct F411 Black Pill"
+PLATFORM = "pyboard"  # sys.platform there
+SENSOR_RATE_HZ = 1000
+
+# A stuck bus costs a tick at most this long (us, whole milliseconds on this port).
+_TIMEOUT_US = 3000
+
+_i2c = I2C(1, freq=400000, timeout=_TIMEOUT_US)  # PB6, PB7
+
+
+def sensor():
+    return MPU6050(_i2c)
+
+
+def display(chunk):
+    return ssd1306.SSD1306_I2C(_i2c, chunk=chunk)
+
+
+def data_ready_pin():
+    return Pin("PB0", Pin.IN)
+
+
+def make_tick(rate, callback):
+    return timing.make_tick(rate, callback, pyb_timer=4)

@@ -1,0 +1,97 @@
+"""Packages for mip: up to date, complete each by itself, and installable from an index."""
+
+import functools
+import http.server
+import json
+import shutil
+import subprocess
+import threading
+
+import pytest
+from conftest import require
+from unix_board import UnixBoard
+from upright import __version__, packages, paths, runtimes
+
+
+def test_the_package_files_are_as_they_would_be_written():
+    wanted = packages.package_files()
+    assert set(paths.LIB.glob("*.json")) | {paths.ROOT / "package.json"} == set(wanted)
+    for path, text in wanted.items():
+        assert path.read_text() == text, f"{path.name}: run `upright packages`"
+
+
+def test_every_module_is_in_a_package_and_every_version_is_the_projects():
+    named = set()
+    for path in packages.package_files():
+        package = json.loads(path.read_text())
+        assert package["version"] == __version__
+        named |= {url.rpartition("/")[2] for _, url in package["urls"]}
+        for _, url in package["urls"]:
+            assert (path.parent / url).exists()
+    assert named == {path.name for path in paths.LIB.glob("*.py")}
+
+
+@pytest.mark.parametrize("name", packages.names())
+def test_a_package_can_be_imported_with_nothing_else_there(name, tmp_path):
+    require("unix")
+    for module in packages.modules(name):
+        shutil.copy(paths.LIB / f"{module}.py", tmp_path)
+    start, _ = runtimes.interpreter("unix")
+    for module in packages.modules(name):
+        done = subprocess.run(
+            [*start, "-c", f"import {module}"],
+            cwd=tmp_path,
+            env={"MICROPYPATH": str(tmp_path)},
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, f"{module} of {name}: {done.stderr}"
+
+
+def test_the_mpu6500_comes_with_its_magnetometer():
+    assert {"mpu6500", "mpu_common", "ist8310", "auxiliary_bus"} <= set(packages.modules("mpu6500"))
+    assert "mahony" not in packages.modules("mpu6500")
+
+
+@pytest.fixture
+def index(tmp_path):
+    """The address of a served index."""
+    folder = tmp_path / "index"
+    packages.write_index(folder)
+    quiet = type("Quiet", (http.server.SimpleHTTPRequestHandler,), {"log_message": lambda *a: None})
+    handler = functools.partial(quiet, directory=folder)
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+@pytest.mark.parametrize("mpy", [True, False], ids=["mpy", "py"])
+def test_mpremotes_mip_installs_from_the_index(index, tmp_path, mpy):
+    from mpremote import mip
+
+    require("unix")
+    flash = tmp_path / "flash"
+    flash.mkdir()
+    board = UnixBoard(flash)
+    try:
+        mip._install_package(board, "mahony", index, "lib", None, mpy)
+        mip._install_package(board, "ssd1306", index, "lib", __version__, mpy)
+        board.exec("import sys\nsys.path.append('lib')\nimport mahony, ssd1306")
+        board.exec("f = mahony.Mahony6(200, (82, 5), 4096)\nf.update(bytearray(22))")
+    finally:
+        board.close()
+    names = {path.stem for path in (flash / "lib").iterdir()}
+    assert names == {*packages.modules("mahony"), *packages.modules("ssd1306")}
+
+
+def test_mip_installs_a_package_file_of_a_clone(tmp_path):
+    from mpremote import mip
+
+    require("unix")
+    board = UnixBoard(tmp_path)
+    try:
+        mip._install_package(board, str(paths.LIB / "calibration.json"), "", "lib", None, True)
+    finally:
+        board.close()
+    assert [path.name for path in (tmp_path / "lib").iterdir()] == ["calibration.py"]
