@@ -22,9 +22,9 @@ DEFAULTS = {
     "MAG_RATE_HZ": 100,
     # Corrections and biases, see calibration.py; made by `upright calibrate`.
     "CALIBRATION": "calibration.json",
-    # The filter by its name in filters.py, and its own arguments.
+    # The filter by its name in filters.py, and its own arguments where its defaults are not wanted.
     "FILTER": "mahony6",
-    "GAINS": {"kp": 0.5, "ki": 0.0},
+    "GAINS": {},
     "EULER": "zyx",
     # Measure the gyro's bias at the start (the board has to lie still for a second).
     "MEASURE_BIAS": True,

@@ -148,8 +148,8 @@ def replay_command(
     runtime: str = typer.Option("cpython", help=_RUNTIME + "."),
     out: Path = typer.Option(None, help="Write rows t,q0,q1,q2,q3 to this CSV file."),
     seconds: float = typer.Option(None, callback=_positive, help="Only the first so many seconds."),
-    kp: float = typer.Option(0.5, help="Proportional gain, rad/s."),
-    ki: float = typer.Option(0.0, help="Integral gain, rad/s^2."),
+    kp: float = typer.Option(None, help="Proportional gain of mahony6 and mahony9, rad/s (0.5)."),
+    ki: float = typer.Option(None, help="Their integral gain, rad/s^2 (0)."),
     direct: bool = typer.Option(
         False, help="Counts straight into the filter, past chip and driver."
     ),
@@ -168,7 +168,7 @@ def replay_command(
                 filter,
                 runtime,
                 seconds,
-                {"kp": kp, "ki": ki},
+                {k: v for k, v in (("kp", kp), ("ki", ki)) if v is not None},
                 direct,
                 lambda at, of: progress.update(task, completed=at),
             )
