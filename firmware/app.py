@@ -17,6 +17,11 @@ _FRAME_MS = const(100)
 _RATE_MS = const(1000)
 _LOST_MS = const(300)  # without a fresh sample the attitude is only carried on
 _RETRY_MS = const(1000)
+_KEEP_AFTER_S = const(
+    10
+)  # so long at rest, and what the filter has learnt of the bias is worth keeping
+_KEEP_EVERY_S = const(600)  # at least between two writes of the flash
+_KEEP_MDPS = const(20)  # and a change
 _HEADING_MS = const(300)  # the first magnetometer sample is waited for as long
 _GUARD_HZ = const(50)
 
@@ -53,6 +58,10 @@ class App:
         self.angles = array("i", [0] * 3)  # roll, pitch, yaw in millidegrees
         self.rate_hz = 0
         self._snapshot = array("i", [0] * ticks.SNAPSHOT_WORDS)
+        self._bias = array("i", [0] * 3)
+        self._status = array("i", [-1] * pages.STATUS_WORDS)
+        self._rested_s = 0
+        self._kept_s = _KEEP_EVERY_S  # since the last write
         self._notes = []  # what start-up could not do, for the display
         self._page = 0
         self._pages = None
@@ -90,11 +99,14 @@ class App:
         self._open_magnetometer()
         self._load_calibration()
         self.filter = filters.make(self.config.FILTER, rate, imu, self.config.GAINS)
-        if self.config.MEASURE_BIAS:
-            self.say("Keep still", "measuring the", "gyro's bias", *self._notes)
-            self.bias_known = self._measure_bias()
-        if not self.bias_known:
-            self._use_stored_bias()
+        # a filter that learns the bias by itself wants a first value, but nobody has to wait for it
+        learns = hasattr(self.filter, "resting")
+        if not learns or not self._use_stored_bias():
+            if self.config.MEASURE_BIAS:
+                self.say("Keep still", "measuring the", "gyro's bias", *self._notes)
+                self.bias_known = self._measure_bias(1 if learns else _REST_TRIES)
+            if not self.bias_known and not learns and not self._use_stored_bias():
+                print("bias: going on without (marked B? on the display)")
         self._seed()
         self._start_tick(rate)
         print(
@@ -181,17 +193,44 @@ class App:
         return flags
 
     def _use_stored_bias(self):
-        """The gyro's bias of the calibration file, where there is one."""
+        """The gyro's bias of the calibration file -> False when there is none."""
         bias = self.calibration.gyro_bias()
         if bias is None:
-            if self.config.MEASURE_BIAS:
-                print("bias: never at rest, going on without (marked B? on the display)")
-            return
+            return False
         self.filter.set_bias(*bias)
         self.bias_known = True
         print("bias: from", self.config.CALIBRATION)
+        return True
 
-    def _measure_bias(self):
+    def _keep_bias(self):
+        """Once a second: what the filter has learnt of the bias into the calibration file, at rest and seldom, since a
+        write of the flash holds up everything for some hundredths of a second on most boards."""
+        self._kept_s += 1
+        if not self.filter.resting:
+            self._rested_s = 0
+            return
+        self.bias_known = True
+        self._rested_s += 1
+        if self._rested_s != _KEEP_AFTER_S or self._kept_s < _KEEP_EVERY_S:
+            return
+        self.filter.bias(self._bias)
+        num, den = self.imu.gyro_scale
+        known = self.calibration.gyro_bias()
+        if known is not None:
+            change = max([abs(self._bias[i] - known[i]) for i in range(3)])
+            if change * 1000 * den < _KEEP_MDPS * 256 * num:
+                return
+        self._kept_s = 0
+        try:
+            x, y, z = self._bias
+            self.calibration.save_gyro_bias(
+                self.config.CALIBRATION, x, y, z, self.imu.chip, self.board.NAME
+            )
+            print("bias: kept in", self.config.CALIBRATION)
+        except (OSError, ValueError) as why:
+            print("bias: not kept:", why)
+
+    def _measure_bias(self, tries):
         """Mean of the gyro over a window at rest -> True; False when it never rested."""
         imu = self.imu
         counts = self.counts
@@ -202,7 +241,7 @@ class App:
         rate_num, rate_den = self.config.RATE if self.config.EXTERNAL_CLOCK else imu.sample_rate
         # half of what the chip and this loop can give
         enough = min(rate_num // rate_den, _REST_READS_HZ) * _REST_WINDOW_MS // 2000
-        for _ in range(_REST_TRIES):
+        for k in range(tries):
             low = array("h", [32767] * 6)
             high = array("h", [-32768] * 6)
             total = [0] * 6
@@ -230,7 +269,9 @@ class App:
                 self.filter.set_bias(*mean)
                 print("bias: %s mdeg/s" % ([m * 1000 * den // (256 * num) for m in mean],))
                 return True
-            self.say("Keep still", "it moves;", "trying again", *self._notes)
+            if k + 1 < tries:
+                self.say("Keep still", "it moves;", "trying again", *self._notes)
+        print("bias: never at rest")
         return False
 
     def _seed(self):
@@ -302,6 +343,8 @@ class App:
             self.rate_hz = ((tick.steps - self._rate_steps) * 1000 + passed // 2) // passed
             self._rate_steps = tick.steps
             self._report()
+            if self.config.KEEP_BIAS and hasattr(self.filter, "resting"):
+                self._keep_bias()
         if time.ticks_diff(now, self._frame_at) >= _FRAME_MS:
             self._frame_at = now
             self.update_angles()
@@ -339,10 +382,11 @@ class App:
         flags = 0 if self.bias_known else pages.BIAS_UNKNOWN
         if time.ticks_diff(now, self._fresh_at) >= _LOST_MS:
             flags |= pages.SENSOR_LOST
-        if self.filter.AXES == 9 and (
-            self.mag is None or time.ticks_diff(now, self._mag_at) >= _LOST_MS
-        ):
+        mag_lost = self.mag is None or time.ticks_diff(now, self._mag_at) >= _LOST_MS
+        if self.filter.AXES == 9 and mag_lost:
             flags |= pages.MAG_LOST
+        if self._page == pages.STATUS:
+            self._fill_status(mag_lost)
         self._pages.draw(
             self._page,
             self.angles,
@@ -350,8 +394,22 @@ class App:
             self.imu.temperature_cdeg(),
             self.faults(),
             flags,
+            self._status,
         )
         display.show()
+
+    def _fill_status(self, mag_lost):
+        """What the status page shows, as far as this filter tells it."""
+        filter, status = self.filter, self._status
+        filter.bias_mdps(self._bias)
+        for i in range(3):
+            status[pages.BIAS + i] = self._bias[i]
+        if hasattr(filter, "resting"):
+            status[pages.REST] = 1 if filter.resting else 0
+            status[pages.DOUBT] = filter.heading_uncertainty_mdeg
+        if filter.AXES == 9:
+            accepted = getattr(filter, "mag_accepted", True)
+            status[pages.FIELD] = 0 if mag_lost else 1 if accepted else 2
 
     # ------------------------------------------------------------------------------------ start-up messages
 

@@ -28,6 +28,8 @@ DEFAULTS = {
     "EULER": "zyx",
     # Measure the gyro's bias at the start (the board has to lie still for a second).
     "MEASURE_BIAS": True,
+    # A filter that learns the gyro's bias: write it into the calibration file when the board rests, for the next start.
+    "KEEP_BIAS": True,
     # True: the display is on the sensor's bus, so the tick writes it, DISPLAY_CHUNK bytes at a time.
     # False: it has a bus of its own and the main program writes it.
     "DISPLAY_SHARES_BUS": True,

@@ -8,9 +8,17 @@ import micropython
 from micropython import const
 from ssd1306 import BLACK, INVERSE, LARGE, SMALL, TALL, WHITE
 
-COUNT = const(2)  # pages that draw() knows
+COUNT = const(3)  # pages that draw() knows
 NUMBERS = const(0)
 HORIZON = const(1)
+STATUS = const(2)
+
+# words of what the status page shows, array('i')
+REST = const(0)  # 1: at rest, 0: moving, -1: the filter does not say
+FIELD = const(1)  # 1: used, 2: rejected, 0: there is none, -1: six axes
+BIAS = const(2)  # 3: the gyro's, millidegrees/s
+DOUBT = const(5)  # how far the heading may be off, millidegrees; -1: the filter does not say
+STATUS_WORDS = const(6)
 
 # flags of draw()
 BIAS_UNKNOWN = const(1)  # the gyro's bias was not measured: the yaw drifts
@@ -96,15 +104,18 @@ class Pages:
         self._rows = display.height - (8 if self._low else 9)  # and its rows
 
     @micropython.native
-    def draw(self, page, angles, rate_hz, temperature, faults, flags):
+    def draw(self, page, angles, rate_hz, temperature, faults, flags, status=None):
         """Draws a page into the display's buffer; the caller then calls display.show().
 
-        page: NUMBERS or HORIZON. angles: array('i') of roll, pitch, yaw in millidegrees, within
-        +-180000. rate_hz: samples per second. temperature: centidegrees Celsius. faults: a count.
+        page: NUMBERS, HORIZON, or STATUS; this wants `status`, an array('i') of STATUS_WORDS. angles:
+        array('i') of roll, pitch, yaw in millidegrees, within +-180000. rate_hz: samples per second.
+        temperature: centidegrees Celsius. faults: a count.
         flags: BIAS_UNKNOWN, SENSOR_LOST, MAG_LOST.
         """
         self._display.fill(BLACK)
-        if page == HORIZON:
+        if page == STATUS:
+            self._draw_state(status)
+        elif page == HORIZON:
             self._draw_horizon(angles)
         elif self._low:
             self._draw_numbers_low(angles)
@@ -229,6 +240,34 @@ class Pages:
         size = SMALL if self._low else TALL
         d.text(name, x, y + (0 if self._low else 8))
         d.text("°", d.number(value, x + 9, y, size, 4, 0, point), y, size)
+
+    # -------------------------------------------------------------------------- status
+
+    @micropython.native
+    def _draw_state(self, status):
+        d = self._display
+        rest = status[REST]
+        if rest >= 0:
+            d.text("AT REST" if rest else "MOVING", 0, 0)
+        field = status[FIELD]
+        if field < 0:
+            d.text("SIX AXES", 60, 0)
+        elif field == 0:
+            d.text("NO FIELD", 60, 0)
+        else:
+            d.text("FIELD OK" if field == 1 else "FIELD BAD", 60, 0)
+        y = 8
+        if not self._low:
+            d.text("GYRO BIAS, °/s", 0, 13)
+            y = 23
+        for i in range(3):
+            d.number(status[BIAS + i], 42 * i, y, SMALL, 6, 2, 3)
+        if status[DOUBT] >= 0:
+            y = 16 if self._low else 38
+            d.text("HEADING +-", 0, y)
+            d.text("°", d.number(status[DOUBT], 66, y, SMALL, 0, 1, 3) + 1, y)
+        if not self._low:
+            d.hline(0, 54, d.width)
 
     # -------------------------------------------------------------------------- messages
 

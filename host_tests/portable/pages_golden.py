@@ -34,6 +34,10 @@ class Bench:
         self.pages.draw(page, array("i", angles), rate, temperature, faults, flags)
         self.show(name)
 
+    def state(self, name, status):
+        self.pages.draw(pages.STATUS, array("i", [0] * 3), 500, 3652, 3, 0, array("i", status))
+        self.show(name)
+
 
 def fonts(bench):
     d = bench.display
@@ -102,6 +106,9 @@ def every_page(bench, tag):
     bench.page("lost_" + tag, pages.NUMBERS, (1000, 2000, 3000), 200, 3652, 12, 3)
     bench.page("no_mag_" + tag, pages.NUMBERS, (1000, 2000, 3000), 1000, 3652, 12, 4)
     bench.page("neither_" + tag, pages.HORIZON, LEVEL, 1000, 3652, 12, 5)
+    bench.state("state_" + tag, (1, 1, 1199, -801, 598, 2345))
+    bench.state("state_bad_field_" + tag, (0, 2, -12345, 20000, -7, 179999))
+    bench.state("state_six_" + tag, (-1, -1, 0, 0, 0, -1))
     bench.pages.message(
         "No MPU6050 at 0x68", "check wiring: SDA GP4, SCL GP5, VCC 3.3 V, GND", "retrying"
     )
