@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from typer.testing import CliRunner
-from upright import cli, scoring, simulate
+from upright import cli, replay, scoring, simulate
 
 
 @pytest.fixture
@@ -152,3 +152,19 @@ def test_a_simulation_that_dies_is_told_with_its_last_words(tmp_path):
     script.write_text("print('so far')\nraise ValueError('no further')\n")
     with pytest.raises(simulate.SimulationError, match=r"(?s)so far.*no further"):
         simulate.run("cpython", script, {})
+
+
+def test_the_demo_compares_filters_on_the_same_motion(upright):
+    done = upright("demo", "--filters", "mahony6,inertial6", "--headless", "--seconds", 4)
+    assert done.exit_code == 0, done.output
+    table = done.output[done.output.index("RMSE, degrees") :]
+    names = [line.split()[0] for line in table.splitlines()[2:4]]
+    assert names == ["mahony6", "inertial6"]
+
+
+def test_the_demo_takes_the_board_that_a_filter_needs_and_refuses_an_unknown_one(upright):
+    done = upright("demo", "--board", "abacus")
+    assert done.exit_code == 2
+    assert "robomaster_a" in done.output
+    assert replay.board_for("inertial9-lite") == "robomaster_a"
+    assert replay.board_for("inertial6") == "sim"

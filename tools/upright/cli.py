@@ -97,7 +97,12 @@ def _positive(seconds: float | None):
 def demo_command(
     trial: Path = typer.Option(None, help="Feed this recorded trial (.npz) through the chip."),
     motion: str = typer.Option("demo", help="Synthetic motion, when there is no --trial."),
-    board: str = typer.Option("sim", help="The board to simulate, a folder of boards/."),
+    board: str = typer.Option(
+        None, help="The board to simulate, a folder of boards/ (sim; with nine axes robomaster_a)."
+    ),
+    filters: str = typer.Option(
+        None, help="Run it with each of these filters, a,b,... and compare (default: the board's)."
+    ),
     headless: bool = typer.Option(
         False, help="No live display: progress, the last picture, the figures."
     ),
@@ -110,8 +115,10 @@ def demo_command(
     runtime: str = typer.Option(None, help=f"{_RUNTIME} (default: unix where it can be had)."),
 ):
     """Boot the firmware on the simulated board: MPU6050, filter in a hard timer tick, OLED; and how far off it was."""
-    from upright import demo, simulate, trials
+    from upright import demo, replay, simulate, trials
 
+    names = filters.split(",") if filters else [None]
+    board = board or (replay.board_for(names[0]) if filters else "sim")
     try:
         if board not in demo.boards():
             raise ValueError(f"unknown board {board!r}; there are {', '.join(demo.boards())}")
@@ -121,9 +128,17 @@ def demo_command(
             else demo.motion_source(motion, seconds, board)
         )
         runtime = runtime or simulate.best_runtime()
-        outcome = demo.show(source, runtime, headless, speed, console)
-        for line in demo.summary(outcome):
-            console.print(line, highlight=False, soft_wrap=True)
+        outcomes = []
+        for name in names:
+            if name:
+                source.board["FILTER"] = name
+            outcome = demo.show(source, runtime, headless or bool(outcomes), speed, console)
+            outcomes.append(outcome)
+            for line in demo.summary(outcome):
+                console.print(line, highlight=False, soft_wrap=True)
+        if len(outcomes) > 1:
+            console.print(demo.compare(outcomes))
+        outcome = outcomes[0]
         if png:
             demo.save_png(outcome, png)
             console.print("picture:", png)
@@ -136,9 +151,9 @@ def demo_command(
         _fail(f"runtime {runtime} cannot be had here: {why}", 3)
     except (simulate.SimulationError, OSError) as why:
         _fail(str(why), 1)
-    r = outcome.result
-    if not r["started"] or r["crashes"] or r["uncaught"]:
-        raise typer.Exit(1)
+    for r in [outcome.result for outcome in outcomes]:
+        if not r["started"] or r["crashes"] or r["uncaught"]:
+            raise typer.Exit(1)
 
 
 @app.command("replay")

@@ -10,6 +10,7 @@ import numpy as np
 from rich.console import Console, Group
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Table
 from rich.text import Text
 
 from upright import oled, paths, runtimes, scoring, simulate, trials
@@ -166,6 +167,26 @@ def summary(outcome: Outcome) -> list[str]:
         version = "?"
     lines.append(f"ran on {outcome.runtime} {version}, {r['ticker']}")
     return lines
+
+
+def compare(outcomes: list[Outcome]) -> Table:
+    """What several filters made of the same motion."""
+    table = Table(box=None, pad_edge=False, title="RMSE, degrees", title_justify="left")
+    table.add_column("filter")
+    for column in ("inclination", "heading", "total"):
+        table.add_column(column, justify="right")
+    for outcome in outcomes:
+        s, north = outcome.score, outcome.result.get("axes") == 9
+        if s is None or not s.samples:
+            table.add_row(outcome.result.get("filter", "?"), "-", "-", "-")
+            continue
+        angles = (
+            s.inclination,
+            s.heading if north else s.aligned_heading,
+            s.total if north else s.aligned_total,
+        )
+        table.add_row(outcome.result["filter"], *(f"{angle:.2f}" for angle in angles))
+    return table
 
 
 def show(source: Source, runtime: str, headless: bool, speed: float | None, console: Console):
