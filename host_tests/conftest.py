@@ -105,3 +105,11 @@ def boot_board(tmp_path):
         return Boot(result, lines, picture, *simulate.read_steps(out), *simulate.read_flags(out))
 
     return run
+
+
+def healthy(result):
+    """Nothing went wrong that should not have."""
+    assert result["started"]
+    assert result["error"] is None
+    assert (result["crashes"], result["uncaught"], result["cuts"]) == (0, 0, 0)
+    assert result["display_misuse"] == []

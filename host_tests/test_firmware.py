@@ -5,6 +5,7 @@ Every run is a process of its own on a runtime; faults are put in at their simul
 
 import numpy as np
 import pytest
+from conftest import healthy
 from upright import demo, scoring, simulate
 
 SECOND = 1000000
@@ -29,14 +30,6 @@ def boot(boot_board, world):
         return boot_board(runtime, **({"world": str(world[0])} | config))[:5]
 
     return run
-
-
-def healthy(result):
-    """Nothing went wrong that should not have."""
-    assert result["started"]
-    assert result["error"] is None
-    assert (result["crashes"], result["uncaught"], result["cuts"]) == (0, 0, 0)
-    assert result["display_misuse"] == []
 
 
 def error_deg(world, rows, q29):

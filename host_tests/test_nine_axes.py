@@ -8,6 +8,7 @@ import json
 import calibration
 import numpy as np
 import pytest
+from conftest import healthy
 from upright import scoring, simulate
 
 SECOND = 1000000
@@ -32,13 +33,6 @@ def boot(boot_board, world):
         return boot_board(runtime, flash, **config)
 
     return run
-
-
-def healthy(result):
-    assert result["started"]
-    assert result["error"] is None
-    assert (result["crashes"], result["uncaught"], result["cuts"]) == (0, 0, 0)
-    assert result["display_misuse"] == []
 
 
 def error(world, run, since_us=0):

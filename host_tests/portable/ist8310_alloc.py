@@ -6,7 +6,10 @@ import gc
 import sys
 from array import array
 
-import micropython
+# CPython and a compiled main program leave their folder out of the path.
+sys.path.append(__file__.rsplit("/", 1)[0] if "/" in __file__ else ".")
+
+from allocation import borrowed, grown, locked
 from auxiliary_bus import AUX_BUSY, AUX_DONE, AUX_NACK, AUX_TIMEOUT, AuxiliaryBus
 from ist8310 import IST8310, IST8310_I2C
 from mpu6050 import MPU6050
@@ -173,45 +176,6 @@ class Ticks:
         health()
 
 
-def locked(tick, n):
-    """Run n ticks with the heap locked: None, or what was raised."""
-    raised = None
-    micropython.heap_lock()
-    try:
-        for i in range(n):
-            tick(i)
-    except MemoryError as e:
-        raised = e
-    micropython.heap_unlock()
-    return raised
-
-
-def grown(tick, n):
-    """Bytes that n ticks take from an open heap and do not give back."""
-    gc.collect()
-    gc.disable()
-    before = gc.mem_alloc()
-    for i in range(n):
-        tick(i)
-    after = gc.mem_alloc()
-    gc.enable()
-    return after - before
-
-
-def borrowed(bus, tick, n):
-    """Bytes taken at any time inside n ticks: a frame over 11 words comes from the heap if it can."""
-    gc.collect()
-    gc.disable()
-    bus.watch = True
-    bus.peak = 0
-    before = gc.mem_alloc()
-    for i in range(245, 245 + n):
-        tick(i)
-    bus.watch = False
-    gc.enable()
-    return bus.peak - before
-
-
 def main():
     bad = 0
     for name in ("behind", "health", "alone", "transactions"):
@@ -221,7 +185,7 @@ def main():
             raised = locked(tick, TICKS) if faults else None
             taken = 0
             if not faults:  # raising takes memory where there is some
-                taken = grown(tick, TICKS) + borrowed(ticks.bus, tick, 300)
+                taken = grown(tick, TICKS) + borrowed(ticks.bus, tick, 300, 245)
             ok = raised is None and taken == 0 and ticks.busy > TICKS // 100
             bad += not ok
             print(

@@ -5,7 +5,10 @@
 import gc
 import sys
 
-import micropython
+# CPython and a compiled main program leave their folder out of the path.
+sys.path.append(__file__.rsplit("/", 1)[0] if "/" in __file__ else ".")
+
+from allocation import borrowed, grown, locked
 from mpu6500 import HEALTH_MISMATCH, HEALTH_REPAIRING, MPU6500
 
 TICKS = 4_000
@@ -167,46 +170,6 @@ class Ticks:
         method()
 
 
-def locked(tick, n):
-    """Run n ticks with the heap locked: None, or what was raised."""
-    raised = None
-    micropython.heap_lock()
-    try:
-        for i in range(n):
-            tick(i)
-    except MemoryError as e:
-        raised = e
-    micropython.heap_unlock()
-    return raised
-
-
-def grown(tick, n):
-    """Bytes that n ticks take from an open heap and do not give back."""
-    gc.collect()
-    gc.disable()
-    before = gc.mem_alloc()
-    for i in range(n):
-        tick(i)
-    after = gc.mem_alloc()
-    gc.enable()
-    return after - before
-
-
-def borrowed(bus, tick, n):
-    """Bytes taken at any time inside n ticks: a frame over 11 words comes from the heap if it
-    can."""
-    gc.collect()
-    gc.disable()
-    bus.watch = True
-    bus.peak = 0
-    before = gc.mem_alloc()
-    for i in range(45, 45 + n):
-        tick(i)
-    bus.watch = False
-    gc.enable()
-    return bus.peak - before
-
-
 def main():
     bad = 0
     for name in ("read", "fifo", "health"):
@@ -218,7 +181,7 @@ def main():
             raised = locked(tick, TICKS) if faults else None
             taken = 0
             if not faults:  # raising takes memory where there is some
-                taken = grown(tick, TICKS) + borrowed(ticks.bus, tick, 30)
+                taken = grown(tick, TICKS) + borrowed(ticks.bus, tick, 30, 45)
             busy = ticks.fresh > TICKS // 10 and ticks.ext.taken > TICKS // 10
             if name == "health":
                 busy = busy and ticks.repairs > TICKS // 20 and ticks.ext.looks > TICKS // 10

@@ -1,0 +1,47 @@
+# How the scripts beside this one find out whether a piece of a tick allocates. Needs a MicroPython.
+
+import gc
+
+import micropython
+
+
+def locked(tick, n):
+    """Run tick(0) to tick(n - 1) with the heap locked: None, or what was raised."""
+    raised = None
+    micropython.heap_lock()
+    try:
+        for i in range(n):
+            tick(i)
+    except MemoryError as e:
+        raised = e
+    micropython.heap_unlock()
+    return raised
+
+
+def grown(tick, n):
+    """Bytes that n ticks take from an open heap and do not give back."""
+    gc.collect()
+    gc.disable()
+    before = gc.mem_alloc()
+    for i in range(n):
+        tick(i)
+    after = gc.mem_alloc()
+    gc.enable()
+    return after - before
+
+
+def borrowed(bus, tick, n, first):
+    """Bytes taken at any time inside n ticks: a frame over 11 words comes from the heap if it can.
+
+    bus: while bus.watch is set its methods keep the most that they have seen taken in bus.peak.
+    """
+    gc.collect()
+    gc.disable()
+    bus.watch = True
+    bus.peak = 0
+    before = gc.mem_alloc()
+    for i in range(first, first + n):
+        tick(i)
+    bus.watch = False
+    gc.enable()
+    return bus.peak - before
