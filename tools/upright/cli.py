@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from upright import __version__, bench, calibrate, doctor, flash, packages, rp2040, runtimes, wiring
+from upright import __version__, bench, calibrate, doctor, flash, packages, rp2040, runtimes, score, wiring
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, rich_markup_mode="rich")
 console = Console()
@@ -78,6 +78,7 @@ packages.register(app)
 flash.register(app)
 doctor.register(app)
 wiring.register(app)
+score.register(app)
 
 _RUNTIME = "cpython, unix, unix32 or arm"
 
