@@ -80,7 +80,8 @@ def test_a_board_without_the_firmware_or_with_that_of_another_is_named(known):
     ]
 
 
-def test_nobody_turns_a_simulated_board():
-    done = CliRunner().invoke(cli.app, ["doctor", "--simulated", "sim", "--axes"])
+@pytest.mark.parametrize("which", [("--simulated", "sim"), ("--emulated",)])
+def test_nobody_turns_a_simulated_board(which):
+    done = CliRunner().invoke(cli.app, ["doctor", *which, "--axes"])
     assert done.exit_code == 1
     assert "real one" in done.output

@@ -3,11 +3,14 @@
 import hashlib
 import json
 import subprocess
+import sys
 
 import pytest
 from conftest import require
+from mpremote.transport import TransportExecError
+from typer.testing import CliRunner
 from unix_board import PowerCut, UnixBoard
-from upright import device, flash, paths, runtimes
+from upright import cli, device, flash, paths, runtimes
 
 
 @pytest.fixture
@@ -177,6 +180,28 @@ def test_sources_give_way_to_compiled_modules_of_their_name(board):
     assert on_board(board.folder) == files
 
 
+def test_a_board_without_hashlib_is_compared_all_the_same(board):
+    install(board(), files_of(1))
+
+    class Bare(UnixBoard):
+        def exec(self, command, data_consumer=None):
+            if "hashlib" in command:
+                raise TransportExecError(1, "ImportError: no module named 'hashlib'")
+            return super().exec(command, data_consumer)
+
+    bare = Bare(board.folder)
+    steps = install(bare, files_of(2))
+    bare.close()
+    assert set(steps.install) == {"main.py", "lib/a.py", "lib/only_in_2.py"}
+    assert on_board(board.folder) == files_of(2)
+
+
+def test_what_the_emulated_board_needs_is_named_where_it_is_missing(monkeypatch):
+    monkeypatch.setitem(sys.modules, "rp2040", None)
+    with pytest.raises(device.DeviceError, match=r"no emulated board: .*rp2040"):
+        device.open_board(None, emulated=True)
+
+
 def test_facts_of_a_board_and_files_that_it_can_load(board):
     facts = device.facts(board())
     assert facts.platform == "linux"
@@ -217,3 +242,9 @@ def test_the_hash_in_the_record_is_that_of_the_file(board):
     record = json.loads((board.folder / flash.RECORD).read_text())
     for name, digest in record["files"].items():
         assert hashlib.sha256((board.folder / name).read_bytes()).hexdigest() == digest
+
+
+def test_only_the_pico_is_emulated():
+    done = CliRunner().invoke(cli.app, ["flash", "pico2", "--emulated"])
+    assert done.exit_code == 1
+    assert "a Pico, not pico2" in done.output

@@ -4,8 +4,12 @@ Stands on mpremote's transports; whatever has their interface will do (the emula
 """
 
 import ast
+import sys
 import time
 from dataclasses import dataclass
+from pathlib import Path
+
+from upright import paths
 
 LEAST_VERSION = (1, 22)
 # sys.implementation._mpy >> 10 (MicroPython's docs, reference/mpyfiles)
@@ -106,6 +110,32 @@ def connect(port: str):
     return transport
 
 
+def open_board(port: str | None, emulated: bool = False):
+    """A transport to the emulated Pico, or to the board on a port: this one, or the only one. Raises DeviceError."""
+    return connect_emulated() if emulated else connect(pick_port(port))
+
+
+def connect_emulated():
+    """The same to an emulated Pico with MPU6050 and SSD1306, whose flash is in the cache between one run and the next.
+
+    Raises runtimes.Unavailable when there is no firmware for it, DeviceError when there is no emulator.
+    """
+    for folder in (paths.SHIM, paths.SIM, paths.HOST_TESTS):
+        if str(folder) not in sys.path:
+            sys.path.append(str(folder))  # last: nothing of the host may be hidden by it
+    try:
+        import micropython  # noqa: F401 (the shim, before anything that needs it)
+        from rp2040 import transport
+    except ImportError as why:
+        raise DeviceError(f"no emulated board: {why}") from None
+    return transport.connect(emulated_flash())
+
+
+def emulated_flash() -> Path:
+    """Where the emulated board's flash is kept."""
+    return paths.cache() / "emulated-pico.flash"
+
+
 def facts(transport) -> Facts:
     """Ask a board what it is."""
     answer = ast.literal_eval(transport.exec(_QUESTIONS).decode().strip().splitlines()[-1])
@@ -118,17 +148,27 @@ def facts(transport) -> Facts:
     )  # fmt: skip
 
 
+def free_bytes(transport) -> int:
+    """What is free of a board's file system."""
+    transport.exec("import os")
+    status = transport.eval("os.statvfs(os.getcwd())")
+    return status[0] * status[3]
+
+
 def restart(transport, seconds: float, on_line):
-    """Soft-reset the board and pass on what it prints for a while, line by line."""
-    line = transport.serial
+    """Soft-reset the board and pass on what it prints for a while, line by line.
+
+    A transport whose board does not live in the host's time has a `clock` of its own.
+    """
+    line, clock = transport.serial, getattr(transport, "clock", time)
     transport.exit_raw_repl()
     line.write(b"\x04")
-    end, rest = time.monotonic() + seconds, b""
-    while time.monotonic() < end:
+    end, rest = clock.monotonic() + seconds, b""
+    while clock.monotonic() < end:
+        clock.sleep(0.02)
         rest += line.read(line.inWaiting() or 0)
         *whole, rest = rest.split(b"\n")
         for text in whole:
             on_line(text.decode("utf-8", "replace").rstrip("\r"))
-        time.sleep(0.02)
     if rest:
         on_line(rest.decode("utf-8", "replace").rstrip("\r"))

@@ -6,6 +6,7 @@ The examination runs on the board, firmware/doctor.py; here are only its beginni
 import ast
 
 import typer
+from mpremote.transport import TransportError
 from rich.console import Console
 
 from upright import device, flash, paths, runtimes, simulate
@@ -75,6 +76,9 @@ def register(app: typer.Typer):
         simulated: str = typer.Option(
             None, help="Examine this simulated board, a folder of boards/."
         ),
+        emulated: bool = typer.Option(
+            False, help="Examine the emulated Pico (`upright flash pico --emulated` before)."
+        ),
     ):
         """Examine a board with the firmware on it: chips, rates, timer, heap, axis maps; and what to fix."""
         console = Console()
@@ -83,19 +87,22 @@ def register(app: typer.Typer):
             console.print(line, highlight=False, markup=False)
 
         try:
+            if axes and (simulated or emulated):
+                raise device.DeviceError("nobody turns a simulated board: --axes needs a real one")
             if simulated:
-                if axes:
-                    raise device.DeviceError(
-                        "nobody turns a simulated board: --axes needs a real one"
-                    )
                 problems = examine_simulated(simulated, simulate.best_runtime(), say)
             else:
-                transport = device.connect(device.pick_port(port))
+                transport = device.open_board(port, emulated)
                 try:
                     problems = examine(transport, axes, south, say)
                 finally:
                     transport.close()
-        except (device.DeviceError, simulate.SimulationError, runtimes.Unavailable) as why:
+        except (
+            device.DeviceError,
+            TransportError,
+            simulate.SimulationError,
+            runtimes.Unavailable,
+        ) as why:
             console.print(str(why), style="red", highlight=False, markup=False)
             raise typer.Exit(1) from None
         raise typer.Exit(1 if problems else 0)

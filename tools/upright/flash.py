@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import typer
+from mpremote.transport import TransportError, TransportExecError
 from rich.console import Console
 from rich.progress import Progress
 
@@ -25,6 +26,25 @@ JOURNAL, NEW = "update.json", ".new"  # as in firmware/update.py
 SOURCES = ("boot.py", "main.py", "board.py")
 # A user's own, if it is not what was installed: kept, unless --force
 KEPT = ("main.py", "board.py")
+# On the board: prints the hash of each file, or None
+_HASH = """
+import hashlib, binascii
+_b = memoryview(bytearray(1024))
+for _name in {names!r}:
+    try:
+        _f = open(_name, 'rb')
+    except OSError:
+        print(None)
+        continue
+    _h = hashlib.sha256()
+    while True:
+        _n = _f.readinto(_b)
+        if not _n:
+            break
+        _h.update(_b[:_n])
+    _f.close()
+    print(binascii.hexlify(_h.digest()).decode())
+"""
 
 
 @dataclass
@@ -96,10 +116,12 @@ def plan(transport, files: dict[str, bytes], force: bool = False) -> Plan:
     """Compare the board's files with what they are to be."""
     record = _read_record(transport)
     before = record.get("files", {})
+    others = {name: _other_form(name) for name in files}
+    hashes = _hashes(transport, [*files, *others.values()])
     install, kept, same = {}, [], 0
     for name, content in files.items():
         wanted = hashlib.sha256(content).hexdigest()
-        found = _hash(transport, name)
+        found = hashes[name]
         if found == wanted:
             same += 1
         elif name in KEPT and found is not None and found != before.get(name) and not force:
@@ -107,15 +129,16 @@ def plan(transport, files: dict[str, bytes], force: bool = False) -> Plan:
         else:
             install[name] = content
     # a .py is imported before a .mpy of its name, and what is no longer part of it only takes space
-    remove = []
-    for name in files:
-        stem, _, form = name.rpartition(".")
-        other = f"{stem}.{'py' if form == 'mpy' else 'mpy'}"
-        if other not in files and _hash(transport, other) is not None:
-            remove.append(other)
+    remove = [name for name in others.values() if name not in files and hashes[name] is not None]
     remove += [name for name in before if name not in files and name not in remove]
-    hashes = {n: hashlib.sha256(c).hexdigest() for n, c in files.items() if n not in kept}
-    return Plan(install, remove, kept, same, {"version": __version__, "files": hashes})
+    installed = {n: hashlib.sha256(c).hexdigest() for n, c in files.items() if n not in kept}
+    return Plan(install, remove, kept, same, {"version": __version__, "files": installed})
+
+
+def _other_form(name: str) -> str:
+    """The file that stands for the same module."""
+    stem, _, form = name.rpartition(".")
+    return f"{stem}.{'py' if form == 'mpy' else 'mpy'}"
 
 
 def execute(transport, plan: Plan, on_progress=None):
@@ -123,12 +146,12 @@ def execute(transport, plan: Plan, on_progress=None):
 
     Interrupted at any point, the board keeps the old files or gets the new ones at its next boot.
     """
-    finish = (paths.FIRMWARE / "update.py").read_text() + "\nfinish()"
-    transport.exec(finish)  # an earlier installation that was interrupted
+    # What the next boot would do, for an earlier installation that was interrupted
+    transport.exec((paths.FIRMWARE / "update.py").read_text() + "\nfinish()")
     record = json.dumps(plan.record).encode()
     files = plan.install | {RECORD: record}
     total, done = sum(map(len, files.values())), 0
-    free = device.facts(transport).free_bytes
+    free = device.free_bytes(transport)
     if total + 8192 > free:
         raise device.DeviceError(f"{total} bytes do not fit: {free} are free on the board")
     for folder in sorted({name.rpartition("/")[0] for name in files} - {""}):
@@ -150,7 +173,7 @@ def execute(transport, plan: Plan, on_progress=None):
     journal = {"install": list(files), "remove": plan.remove}
     transport.fs_writefile(JOURNAL + NEW, json.dumps(journal).encode())
     transport.exec(f"import os\nos.rename({JOURNAL + NEW!r}, {JOURNAL!r})")
-    transport.exec(finish)  # what the next boot would do
+    transport.exec("finish()")
 
 
 def _read_record(transport) -> dict:
@@ -159,6 +182,15 @@ def _read_record(transport) -> dict:
     except (OSError, ValueError):
         return {}
     return record if isinstance(record, dict) else {}
+
+
+def _hashes(transport, names) -> dict[str, str | None]:
+    """SHA-256 of each file on the board, None where there is none. One command for all: each costs a round trip."""
+    try:
+        said = transport.exec(_HASH.format(names=list(names))).decode().split()
+    except TransportExecError:
+        return {name: _hash(transport, name) for name in names}  # no hashlib there
+    return {n: None if h == "None" else h for n, h in zip(names, said, strict=True)}
 
 
 def _hash(transport, name: str) -> str | None:
@@ -233,7 +265,11 @@ def register(app: typer.Typer):
         source: bool = typer.Option(False, help="Install sources, not compiled modules."),
         force: bool = typer.Option(False, help="Replace a main.py or board.py of your own, too."),
         seconds: float = typer.Option(
-            5, help="Show what the board says after its restart for so long."
+            None,
+            help="Show what the board says after its restart for so long (default: 5, emulated 2).",
+        ),
+        emulated: bool = typer.Option(
+            False, help="Install on an emulated Pico, whose flash is kept between the runs."
         ),
     ):
         """Install the firmware on a board over USB: compiled for it, only what changed, verified, never half."""
@@ -241,15 +277,19 @@ def register(app: typer.Typer):
         try:
             if not (paths.BOARDS / board / "board.py").exists():
                 board_files(board, None)
-            transport = device.connect(device.pick_port(port))
+            if emulated and board != "pico":
+                raise device.DeviceError(f"the emulated board is a Pico, not {board}")
+            transport = device.open_board(port, emulated)
             try:
                 run(transport, board, source, force, console)
                 console.print("restarting:")
                 device.restart(
-                    transport, seconds, lambda line: console.print("  " + line, highlight=False)
+                    transport,
+                    seconds or (2 if emulated else 5),
+                    lambda line: console.print("  " + line, highlight=False, markup=False),
                 )
             finally:
                 transport.close()
-        except device.DeviceError as why:
+        except (device.DeviceError, TransportError, runtimes.Unavailable) as why:
             console.print(str(why), style="red", highlight=False, markup=False)
             raise typer.Exit(1) from None
