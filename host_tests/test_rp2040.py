@@ -4,15 +4,23 @@ One flight (boot, five seconds of motion, then what must fail) serves many tests
 """
 
 import hashlib
+import io
 import itertools
+import math
 from array import array
+from pathlib import Path
 
+import numpy as np
 import pytest
 import rp2040
+from chips.ist8310 import IST8310Chip
 from chips.mpu6050 import MPU6050Chip
+from chips.mpu6500 import MPU6500Chip
 from chips.ssd1306 import SSD1306Chip
+from rich.console import Console
+from upright import bench as bench_command
+from upright import replay, runtimes, scoring, trials
 from upright import rp2040 as firmware
-from upright import runtimes, scoring
 from world import StillWorld, World
 
 # A firmware that is not there yet is built first, which takes minutes.
@@ -76,7 +84,7 @@ def motion(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def files(version):
-    return rp2040.project(version, "pico", rp2040.TELL + "PAGE_SECONDS = 0\n")
+    return rp2040.project(version, "pico", rp2040.TELL + "PAGE_SECONDS = 0\nFILTER = 'mahony6'\n")
 
 
 @pytest.fixture(scope="module")
@@ -88,17 +96,26 @@ def flight(image, files, motion):
     flight.checkpoint = flight.fingerprint()
     flight.board.run(FLIGHT_S - CHECKPOINT_S)
     flight.seconds = (flight.board.now_us - began) / 1e6
+    flight.ticks = len(flight.history)
     flight.reads = [t for t in flight.bus.log if t[2] == IMU and t[4] > 14 and t[0] > began]
     flight.cuts, flight.whole = flight.bus.cuts, all(t[5] for t in flight.bus.log)
     return flight
+
+
+def steps_and_fresh(board):
+    """-> [steps, steps with a fresh sample] of one moment: the tick goes on."""
+    return board.eval(
+        "(lambda out: application.tick.snapshot(out) and list(out)[5:])"
+        "(__import__('array').array('i', [0] * 7))"
+    )
 
 
 @pytest.fixture(scope="module")
 def landed(flight):
     """The same board, main.py interrupted: its timer still ticks. `numbers`: the application's counters."""
     flight.board.interrupt()
-    flight.numbers = flight.board.eval(
-        "[application.tick.steps, application.tick.fresh, application.tick.missed, application.tick.crashes,"
+    flight.numbers = steps_and_fresh(flight.board) + flight.board.eval(
+        "[application.tick.missed, application.tick.crashes,"
         " application.imu.errors, application.imu.resets, application.display.errors]"
     )
     return flight
@@ -121,7 +138,7 @@ def test_every_tick_came_and_had_a_fresh_sample(landed):
     assert fresh == steps
     numbers = [step[0] for step in landed.history]
     assert numbers == list(range(1, len(numbers) + 1))
-    assert abs(len(numbers) - landed.seconds * 200) <= 2
+    assert abs(landed.ticks - landed.seconds * 200) <= 2
 
 
 def test_sensor_and_display_share_a_bus_and_no_transfer_is_cut(flight):
@@ -159,9 +176,7 @@ def test_the_quaternions_are_cpythons_bit_for_bit(landed):
         gyro_scale = landed.world.gyro_scale
         accel_lsb_per_g = landed.world.accel_lsb_per_g
 
-    from config import DEFAULTS
-
-    here = filters.make("mahony6", (200, 1), Scales, DEFAULTS["GAINS"])
+    here = filters.make("mahony6", (200, 1), Scales, {})
     here.state[:] = landed.steps.first_state
     q = array("i", [0] * 4)
     for number, _, counts, there in landed.history:
@@ -172,8 +187,6 @@ def test_the_quaternions_are_cpythons_bit_for_bit(landed):
 
 
 def test_the_attitude_is_right(landed, motion):
-    import numpy as np
-
     q = np.array([step[3] for step in landed.history]) / scoring.ONE
     t = np.array([step[1] for step in landed.history]) / 1000
     score = scoring.score(t, q, motion[1].t, motion[1].q_true)
@@ -280,32 +293,156 @@ def test_ticks_that_are_kept_from_coming_are_missed(landed):
 
 
 # ---------------------------------------------------------------- replay
-def test_recorded_samples_give_the_quaternions_that_they_give_on_cpython(image, version, tmp_path):
+def as_trial(motion):
+    """A rendered motion as a recorded trial without a truth."""
+    return trials.Trial(
+        name=motion.name,
+        counts=motion.counts,
+        rate=motion.rate,
+        accel_lsb_per_g=motion.accel_lsb_per_g,
+        gyro_scale=motion.gyro_scale,
+        mag_uT_per_lsb=None,
+        gt_every=None,
+        q_gt=None,
+        movement=None,
+        header={},
+    )
+
+
+def test_a_replay_on_the_board_writes_the_bytes_that_cpython_writes(image, tmp_path, monkeypatch):
     """Through the chip's registers, the driver and the tick, in the data-ready line's hard interrupt."""
     import motions
-    import numpy as np
-    from upright import simulate
 
-    path, out, rows = tmp_path / "bursts.imu", tmp_path / "out", 300
-    motions.render("bursts", rate=(2000, 7), seconds=1.5, seed=7).write(path, clocked=True)
+    trial = as_trial(motions.render("bursts", rate=(2000, 7), seconds=1.5, seed=7))
     gains = {"kp": 1.0, "ki": 0.05}
-    config = {"world": str(path), "gains": gains, "out": str(out), "rows": rows}
-    simulate.run("cpython", simulate.REPLAY, config)
-    expected = simulate.read_attitudes(out)
-    files = rp2040.project(version, application=False)
+    # nobody says how much of it: as much as is short, and that is told
+    monkeypatch.setattr(replay, "BOARD_SECONDS", 1.05)
+    told = io.StringIO()
+    monkeypatch.setattr(runtimes, "console", Console(file=told, width=200))
     progress = []
-    q29, faults = rp2040.replay(
-        image,
-        files,
-        MPU6050Chip(World(path)),
-        rows=rows,
-        gains=gains,
-        on_progress=lambda done, of: progress.append((done, of)),
+    there = replay.replay(
+        trial, runtime="rp2040", gains=gains, on_progress=lambda *at: progress.append(at)
     )
-    assert not any(faults.values()), faults
-    assert (np.array(q29) == expected).all()
-    assert len(np.unique(expected, axis=0)) > rows // 2
-    assert progress[-1][1] == rows
+    here = replay.replay(trial, seconds=1.05, gains=gains)
+    assert "the first 1.05 of" in told.getvalue()
+    for name, q29 in (("there", there.q29), ("here", here.q29)):
+        scoring.write_csv(tmp_path / name, q29, trial.rate)
+    lines = (tmp_path / "there").read_bytes()
+    assert lines == (tmp_path / "here").read_bytes()
+    assert len({tuple(q) for q in there.q29.tolist()}) > 150
+    assert progress[-1] == (300, 300)
+
+
+@pytest.mark.parametrize(
+    ("options", "why"), [({"direct": True}, "registers"), ({"filter_name": "mahony9"}, "six axes")]
+)
+def test_what_the_board_does_not_replay_is_refused(options, why):
+    import motions
+
+    with pytest.raises(ValueError, match=why):
+        replay.replay(as_trial(motions.render("static", seconds=1)), runtime="rp2040", **options)
+
+
+# ---------------------------------------------------------------- nine axes on SPI
+MAG_AXES = ("y", "-x", "-z")  # as spi_board.py has them
+NINE_S = 1.0
+
+
+@pytest.fixture(scope="module")
+def nine(image, version, tmp_path_factory):
+    """MPU6500 and IST8310 on the SPI peripheral, main.py for NINE_S seconds in slow motion, then interrupted."""
+    import motions
+
+    path = tmp_path_factory.mktemp("nine") / "slow.imu"
+    motion = motions.render("slow", rate=(1000, 1), seconds=3)
+    motion.write(path)
+    files = rp2040.project(version)
+    files["board.py"] = (Path(rp2040.__file__).parent / "spi_board.py").read_bytes()
+    board = rp2040.Board(image, files)
+    board.motion = motion
+    board.spi_bus = board.spi(0)
+    board.world = World(path)
+    board.imu = board.spi_bus.add(MPU6500Chip(board.world), cs=17)
+    board.mag = IST8310Chip(board.world, axes=MAG_AXES)
+    board.imu.aux.append(board.mag)
+    board.boot()
+    board.expect("drive", 5)
+    board.start(board.world)
+    board.spi_bus.log = []
+    board.run(NINE_S)
+    board.seen, board.spi_bus.log = board.spi_bus.log, None
+    board.interrupt()
+    return board
+
+
+def attitude(board):
+    """-> (quaternion as floats, world row of about now) of the running tick."""
+    row = board.world.index(board.now_us - board.world.start_us)
+    q = board.eval(
+        "(lambda out: application.tick.snapshot(out) and list(out))"
+        "(__import__('array').array('i', [0] * 7))"
+    )
+    return np.array(q[:4]) / scoring.ONE, row
+
+
+def test_nine_axes_over_spi_are_all_fresh(nine):
+    console = nine.console
+    assert "sensor: MPU6500" in console
+    assert "magnetometer: IST8310" in console
+    steps, fresh = steps_and_fresh(nine)
+    mag_fresh = nine.eval("application.mag.fresh")
+    assert fresh == steps
+    assert abs(steps - NINE_S * 100) <= 6  # the prompt takes its time
+    assert abs(mag_fresh - steps / 2) <= 8  # 50 Hz, and those before the first tick
+    faults = nine.eval(
+        "(application.tick.missed, application.tick.crashes, application.imu.errors, application.imu.resets,"
+        " application.mag.stale, application.mag.errors, application.mag.resets, application.mag.saturated)"
+    )
+    assert not any(faults), faults
+    assert nine.imu.misuse == nine.mag.misuse == []
+
+
+def test_what_goes_over_spi_keeps_the_sensors_limits(nine):
+    assert len(nine.seen) > NINE_S * 100 * 23  # a burst: its address, 1 + 14 + 7 bytes
+    assert {mode for _, _, mode, _, _ in nine.seen} == {0}
+    assert max(hz for _, hz, _, _, _ in nine.seen) <= 20_000_000
+    written = {hz for _, hz, _, out, _ in nine.seen if not out & 0x80 and out}
+    assert all(hz <= 1_000_000 for hz in written)
+
+
+def test_nine_axes_over_spi_give_the_true_attitude_with_its_heading(nine):
+    q, row = attitude(nine)
+
+    def off(row):
+        dot = abs(float(q @ nine.motion.q_true[row]))
+        return 2 * math.degrees(math.acos(min(1.0, dot)))
+
+    assert off(row) < 3
+    assert off(0) > off(row)  # it moved, and was followed
+
+
+def test_the_fifo_drive_in_a_hard_interrupt_loses_nothing(nine):
+    said = nine.exec(
+        "import time\n"
+        "application.ticker.stop()\n"
+        "application.config.DRIVE = 'fifo'\n"
+        "application._start_tick(application.imu.sample_rate)\n"
+        "fresh = application.mag.fresh\n"
+        "time.sleep_ms(500)\n"
+        "application.ticker.stop()\n"
+        "tick, imu, mag = application.tick, application.imu, application.mag\n"
+        "print(application.ticker.what, application.ticker.period_us, sep=',')\n"
+        "print(tick.steps, tick.fresh, mag.fresh - fresh, tick.crashes, imu.errors, imu.resets, imu.fifo_overflows,"
+        " imu.fifo_lost, mag.errors, mag.resets)\n"
+    )
+    what, numbers = said.splitlines()
+    assert what == "machine.Timer, hard,20000"
+    steps, fresh, mag_fresh, *faults = map(int, numbers.split())
+    assert 46 <= steps <= 50
+    assert fresh == steps
+    assert abs(mag_fresh - steps / 2) <= 2
+    assert not any(faults), faults
+    assert nine.imu.misuse == []
 
 
 # ---------------------------------------------------------------- the bench: the emulated board itself
@@ -548,13 +685,103 @@ def test_modules_compiled_for_another_machine_are_refused(bench, version, tmp_pa
     assert bench.flash()["probe.mpy"] != right
 
 
+def test_a_soft_reset_stops_the_hard_timer_and_keeps_the_files(bench):
+    bench.exec(
+        "from micropython import const\n"
+        "n = [0]\n"
+        "def tick(timer):\n"
+        "    n[0] += 1\n"
+        "    bus.readfrom_mem_into(0x42, 0x10, buf)\n"
+        "timer = Timer(-1, period=5, callback=tick, hard=True)\n"
+        "time.sleep_ms(52)\n"
+    )
+    assert bench.eval("n[0]") >= 10
+    bench.soft_reset()
+    bench.expect("MPY: soft reboot", 2)
+    bench.expect(">>> ", 2)
+    transfers = bench.bus.transfers
+    bench.run(0.05)
+    assert bench.bus.transfers == transfers
+    assert bench.resets == 0
+    assert bench.eval("'n' in globals()") is False
+    assert bench.eval("open('own.txt').read()") == "mine"
+    bench.exec(
+        "import machine, time\n"
+        "from machine import I2C, Pin\n"
+        "bus = I2C(0, scl=Pin(5), sda=Pin(4), freq=400000, timeout=3000)\n"
+    )
+    assert bench.eval("bus.readfrom_mem(0x42, 0x10, 2)") == b"\x10\x11"
+
+
+def test_a_watchdog_that_is_fed_waits_and_one_that_is_not_resets(bench):
+    bench.exec(
+        "dog = machine.WDT(timeout=50)\nfor _ in range(8):\n    dog.feed()\n    time.sleep_ms(20)\n"
+    )
+    assert bench.resets == 0
+    bench.run_until(lambda: bench.resets == 1 and bench.connected, 5, "reset")
+    bench.run(0.05)
+    assert bench.eval("__import__('machine').reset_cause()") == 3  # WDT_RESET
+    assert bench.eval("open('own.txt').read()") == "mine"
+
+
 def test_machine_reset_boots_again_with_its_files(bench):
     """Last: what it had in memory is gone."""
-    bench.send(b"\r\x03machine.reset()\r")
-    bench.run_until(lambda: bench.resets == 1 and bench.connected, 5, "reset")
+    resets = bench.resets
+    bench.send(b"\r\x03import machine; machine.reset()\r")
+    bench.run_until(lambda: bench.resets > resets and bench.connected, 5, "reset")
     bench.run(0.05)
     assert bench.eval("open('own.txt').read()") == "mine"
     assert bench.eval("__import__('machine').reset_cause()") == 3  # WDT_RESET
+
+
+# ---------------------------------------------------------------- cycles
+def test_cycles_are_counted_between_a_programs_marks(image, version, tmp_path):
+    source = tmp_path / "counts.py"
+    source.write_text(
+        "import sys\n"
+        "from micropython import const\n"
+        "import micropython\n"
+        "@micropython.viper\n"
+        "def spin(n: int):\n"
+        "    while n:\n"
+        "        n -= 1\n"
+        "spin(1)\n"
+        "n = int(sys.argv[2])\n"
+        "for part, each in (('less', 100), ('more', 300)):\n"
+        "    for steps in (0, n):\n"
+        "        print('@begin %s %d' % (part, steps))\n"
+        "        spin(steps * each)\n"
+        "        print('@end %s %d' % (part, steps))\n"
+    )
+    files = {"counts.mpy": rp2040.compile_module(source, rp2040.files.mpy_cross(version))}
+    of = bench_command.per_step(rp2040.between_marks(image, files, "counts", "trace", 100))
+    assert of.keys() == {"less", "more"}
+    assert 100 * 3 < of["less"] < 100 * 30
+    assert 2.8 < of["more"] / of["less"] < 3.2
+
+
+def test_the_benchmark_has_a_section_of_the_board_and_says_where_it_cannot(tmp_path, monkeypatch):
+    figures = bench_command.Figures(
+        cycles={part: 1000.0 * (k + 1) for k, part in enumerate(bench_command.PARTS)}
+    )
+    file = tmp_path / "benchmarks.md"
+    for _ in range(2):  # what was saved is replaced
+        file.write_text(file.read_text() if file.exists() else bench_command.DOCS.read_text())
+        bench_command.save(figures, file)
+    text = file.read_text()
+    assert text.count("On the emulated RP2040: cycles and microseconds") == 1
+    assert "| sensor read | 1,000 | 8 |" in text
+
+    def not_here():
+        raise runtimes.Unavailable("no mirror")
+
+    monkeypatch.setattr(bench_command.rp2040, "image", not_here)
+    for other in ("microseconds", "allocated", "instructions", "bus_calls"):
+        monkeypatch.setattr(bench_command, other, lambda *a, **k: {})
+    monkeypatch.setattr(bench_command, "net", lambda *a: {"float": 1.0})
+    figures = bench_command.measure()
+    assert "cycles on rp2040: not measured: no mirror" in figures.not_here
+    assert bench_command.board_rows(figures) == []
 
 
 # ---------------------------------------------------------------- the image

@@ -13,6 +13,7 @@ CPython, in emulated time only: two runs are the same to the cycle. A second of 
 
 import rp2040.version  # noqa: F401 (first: it refuses what was not tried)
 from rp2040.board import Board, BoardError
+from rp2040.cycles import between_marks
 from rp2040.files import compile_module, flash_image, project
 from rp2040.steps import TELL, Steps, replay
 
@@ -21,6 +22,7 @@ __all__ = [
     "Board",
     "BoardError",
     "Steps",
+    "between_marks",
     "compile_module",
     "flash_image",
     "project",

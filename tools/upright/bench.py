@@ -1,4 +1,5 @@
-"""What a tick costs: Thumb-2 instructions under qemu-arm, microseconds on the unix port, bytes allocated.
+"""What a tick costs: Thumb-2 instructions under qemu-arm, microseconds on the unix port, bytes allocated; and cycles
+on the emulated RP2040.
 
 Everything is measured beside a plain float filter in the same run, and told as a ratio to it: ratios hold on another
 machine, microseconds do not. host_tests/portable/bench_steps.py is what runs.
@@ -18,7 +19,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from upright import paths, runtimes
+from upright import paths, replay, rp2040, runtimes
 
 PORTABLE = paths.HOST_TESTS / "portable"
 STEPS = "bench_steps"
@@ -40,6 +41,8 @@ _FLOAT = "collected"  # what the ratios are to
 _AROUND = ("empty", "bus_read", "bus_write")  # measured to be subtracted
 TRACE_STEPS = 32
 TRACE_HEAP = "192K"  # about a Pico's
+BOARD_STEPS = 16
+BOARD_MHZ = 125  # of the RP2040, as MicroPython sets it
 TIME_LINES = 25
 _BATCH = 256  # steps in one line of `time`
 SMALL_HEAP = "512K"  # objects are twice as large on 64 bits: about a board's 256 KB
@@ -62,6 +65,7 @@ class Figures:
     instructions: dict[str, float] = field(default_factory=dict)  # a step, on arm
     microseconds: dict[str, float] = field(default_factory=dict)  # a step, on unix
     allocated: dict[str, dict[str, float]] = field(default_factory=dict)  # runtime: bytes a step
+    cycles: dict[str, float] = field(default_factory=dict)  # a step, on the emulated RP2040
     not_here: list[str] = field(default_factory=list)
 
 
@@ -217,6 +221,27 @@ def instructions(
     return found
 
 
+def cycles(n: int = BOARD_STEPS, on_mark: Callable[[int], None] = lambda at: None):
+    """Cycles of each part's step on the emulated RP2040, with what surrounds it -> {part: cycles}.
+
+    The same program as instructions() traces, compiled for that board. Raises Unavailable and BenchError.
+    """
+    image, emulated = rp2040.image(), replay.emulated_board()
+    cross = emulated.files.mpy_cross(rp2040.version(image))
+    programs = (paths.FIRMWARE / "tick.py", PORTABLE / "float_mahony.py", PORTABLE / f"{STEPS}.py")
+    try:
+        files = {
+            f"{'lib/' if path.parent == paths.LIB else ''}{path.stem}.mpy": emulated.compile_module(
+                path, cross
+            )
+            for path in (*sorted(paths.LIB.glob("*.py")), *programs)
+        }
+        marks = emulated.between_marks(image, files, STEPS, "trace", n, on_mark=on_mark)
+    except (emulated.BoardError, ValueError) as why:
+        raise BenchError(f"the run on rp2040 failed: {str(why).splitlines()[-1]}") from None
+    return per_step(marks)
+
+
 # ---------------------------------------------------------------------------------------- time, memory
 def net(spent: dict[str, float], calls: dict[str, tuple[float, float]]) -> dict[str, float]:
     """Take the loop and the stand-in bus off what a step costs. calls: {part: (reads, writes) a step}."""
@@ -270,11 +295,15 @@ def measure(progress: Progress | None = None) -> Figures:
     def trace(runtime, at):
         figures.instructions = net(instructions(on_mark=at), bus_calls(runtime))
 
+    def board(runtime, at):
+        figures.cycles = net(cycles(on_mark=at), bus_calls("cpython"))
+
     jobs = (
         ("microseconds", "unix", time),
         ("memory", "unix32", memory),
         ("memory", "arm", memory),
         ("instructions", "arm", trace),
+        ("cycles", "rp2040", board),
     )
     for what, runtime, job in jobs:
         task = progress.add_task(f"{what} on {runtime}", total=marks) if progress else None
@@ -307,6 +336,22 @@ def rows(figures: Figures) -> Iterator[tuple[str, ...]]:
         yield tuple(cells)
 
 
+BOARD_TITLE = "on the emulated RP2040: cycles and microseconds"
+
+
+def board_rows(figures: Figures) -> list[tuple[str, ...]]:
+    """The table of the emulated board as text, its head first; empty where there was none."""
+    of = figures.cycles
+    if not of:
+        return []
+    body = [
+        (text, f"{of[part]:,.0f}", f"{of[part] / BOARD_MHZ:,.0f}", f"{of[_FLOAT] / of[part]:.1f}")
+        for part, text in PARTS.items()
+        if part in of
+    ]
+    return [("", "cycles", f"us at {BOARD_MHZ} MHz", "ratio"), *body]
+
+
 def remarks(figures: Figures) -> Iterator[str]:
     """What the table says, in sentences."""
     of = figures.instructions
@@ -327,12 +372,29 @@ def save(figures: Figures, file: Path) -> None:
     text = file.read_text()
     if not re.search(f"{_BEGIN}.*{_END}", text, re.DOTALL):
         raise ValueError(f"{file} has no place for the figures: {_BEGIN} ... {_END}")
-    head, *body = rows(figures)
-    table = ["| " + " | ".join(head) + " |", "| --- |" + " ---: |" * (len(head) - 1)]
-    table += ["| " + " | ".join(row) + " |" for row in body]
-    new = "\n".join([_BEGIN, "", *table, "", *(f"- {r}" for r in remarks(figures)), "", _END])
+    new = [_BEGIN, "", *_markdown(rows(figures)), "", *(f"- {r}" for r in remarks(figures)), ""]
+    if figures.cycles:
+        title = BOARD_TITLE[0].upper() + BOARD_TITLE[1:]
+        new += [f"### {title}", "", *_markdown(board_rows(figures)), ""]
+    new = "\n".join([*new, _END])
     head_text, tail = text.split(_BEGIN)[0], text.split(_END)[1]
     file.write_text(head_text + new + tail)
+
+
+def _markdown(lines: Iterable[tuple[str, ...]]) -> list[str]:
+    head, *body = lines
+    table = ["| " + " | ".join(head) + " |", "| --- |" + " ---: |" * (len(head) - 1)]
+    return table + ["| " + " | ".join(row) + " |" for row in body]
+
+
+def _show(console: Console, title: str, lines: Iterable[tuple[str, ...]]) -> None:
+    head, *body = lines
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    for k, text in enumerate(head):
+        table.add_column(text, justify="right" if k else "left")
+    for row in body:
+        table.add_row(*row)
+    console.print(table)
 
 
 def register(app: typer.Typer) -> None:
@@ -349,15 +411,9 @@ def register(app: typer.Typer) -> None:
         columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
         with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
             figures = measure(progress)
-        head, *body = rows(figures)
-        table = Table(
-            title="one step, without loop and bus", title_justify="left", box=None, pad_edge=False
-        )
-        for k, text in enumerate(head):
-            table.add_column(text, justify="right" if k else "left")
-        for row in body:
-            table.add_row(*row)
-        console.print(table)
+        _show(console, "one step, without loop and bus", rows(figures))
+        if figures.cycles:
+            _show(console, BOARD_TITLE, board_rows(figures))
         for remark in remarks(figures):
             console.print(remark, highlight=False, soft_wrap=True)
         if save_to:

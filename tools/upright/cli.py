@@ -8,7 +8,18 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from upright import __version__, bench, calibrate, doctor, flash, packages, rp2040, runtimes, score, wiring
+from upright import (
+    __version__,
+    bench,
+    calibrate,
+    doctor,
+    flash,
+    packages,
+    rp2040,
+    runtimes,
+    score,
+    wiring,
+)
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, rich_markup_mode="rich")
 console = Console()
@@ -161,7 +172,9 @@ def demo_command(
 def replay_command(
     trial: Path = typer.Argument(..., help="Recorded trial, .npz."),
     filter: str = typer.Option("mahony6", help="The filter."),
-    runtime: str = typer.Option("cpython", help=_RUNTIME + "."),
+    runtime: str = typer.Option(
+        "cpython", help="cpython, unix, unix32, arm, or rp2040, the emulated board."
+    ),
     out: Path = typer.Option(None, help="Write rows t,q0,q1,q2,q3 to this CSV file."),
     seconds: float = typer.Option(None, callback=_positive, help="Only the first so many seconds."),
     kp: float = typer.Option(None, help="Proportional gain of mahony6 and mahony9, rad/s (0.5)."),
@@ -186,7 +199,7 @@ def replay_command(
                 seconds,
                 {k: v for k, v in (("kp", kp), ("ki", ki)) if v is not None},
                 direct,
-                lambda at, of: progress.update(task, completed=at),
+                lambda at, of: progress.update(task, completed=at, total=of),
             )
             progress.update(task, completed=len(done.q29))
         if out:

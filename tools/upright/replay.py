@@ -1,12 +1,16 @@
 """Replays recorded trials through a filter on a runtime."""
 
+import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from upright import scoring, simulate, trials
+from upright import paths, rp2040, runtimes, scoring, simulate, trials
+
+# of a trial on rp2040 when nobody asks for more: each takes ten or more of this machine's
+BOARD_SECONDS = 2
 
 
 @dataclass
@@ -35,8 +39,18 @@ def replay(
 ) -> Replay:
     """Replay a trial: through the chip model's registers, driver and tick, or `direct`, counts to filter.
 
-    on_progress(done, of) is called now and then. Raises simulate.SimulationError.
+    seconds      only the first so many; None: all of it, on rp2040 BOARD_SECONDS
+    on_progress  called with (rows done, rows in all) now and then
+    Raises simulate.SimulationError, runtimes.Unavailable, and ValueError for what a runtime cannot do.
     """
+    if runtime == "rp2040":
+        if direct:
+            raise ValueError("on rp2040 the counts come through the chip's registers, not straight")
+        if board_for(filter_name) != "sim":
+            raise ValueError(
+                f"{filter_name} on rp2040: the emulated board is replayed without a magnetometer; take six axes"
+            )
+        return _on_board(trial, filter_name, seconds, gains or {}, on_progress)
     with tempfile.TemporaryDirectory() as folder:
         world, out = Path(folder) / "trial.imu", Path(folder) / "attitudes"
         rows = trial.write(world, seconds)
@@ -61,5 +75,56 @@ def replay(
         raise simulate.SimulationError(
             f"{result['fresh']} of {rows} samples reached the filter fresh, {len(q29)} steps; {faults}"
         )
+    return _scored(trial, q29, result)
+
+
+def _scored(trial, q29, result) -> Replay:
     score = scoring.score_trial(q29 / scoring.ONE, trial) if trial.has_truth else None
     return Replay(trial, q29, result, score)
+
+
+def emulated_board():
+    """host_tests/rp2040, and the chips' models on the search path. Raises runtimes.Unavailable."""
+    for folder in (paths.HOST_TESTS, paths.SIM, paths.SHIM):
+        if str(folder) not in sys.path:
+            sys.path.append(str(folder))  # last: nothing of the host may be hidden by it
+    try:
+        import micropython  # noqa: F401 (the stand-in: it prepares what the chips' models import)
+        import rp2040 as emulated
+    except ImportError as why:
+        raise runtimes.Unavailable(str(why)) from None
+    return emulated
+
+
+def _on_board(trial, filter_name, seconds, gains, on_progress) -> Replay:
+    """MicroPython's own firmware on an emulated RP2040; see host_tests/rp2040."""
+    image, emulated = rp2040.image(), emulated_board()
+    from chips.mpu6050 import MPU6050Chip
+    from world import World
+
+    if seconds is None and trial.seconds > BOARD_SECONDS:
+        seconds = BOARD_SECONDS
+        runtimes.console.print(
+            f"rp2040: the first {seconds} of {trial.seconds:.1f} s, each of which takes ten or more here;"
+            " --seconds for more",
+            highlight=False,
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "trial.imu"
+        rows = trial.write(path, seconds)
+        world = World(str(path))
+        try:
+            files = emulated.project(rp2040.version(image), application=False)
+            q29, faults = emulated.replay(
+                image, files, MPU6050Chip(world), filter_name, rows, gains, on_progress
+            )
+        except emulated.BoardError as why:
+            raise simulate.SimulationError(f"on rp2040: {why}") from None
+        finally:
+            world.close()
+    if on_progress:
+        on_progress(len(q29), rows)
+    faults = {what: n for what, n in faults.items() if n}
+    if len(q29) != rows or faults:
+        raise simulate.SimulationError(f"rp2040: {len(q29)} of {rows} steps; {faults}")
+    return _scored(trial, np.array(q29, np.int32), {"rows": rows, "fresh": rows})
