@@ -98,7 +98,8 @@ class App:
             rate = imu.sample_rate
         self._open_magnetometer()
         self._load_calibration()
-        self.filter = filters.make(self.config.FILTER, rate, imu, self.config.GAINS)
+        name = self.config.FILTER or ("inertial6" if self.mag is None else "inertial9")
+        self.filter = filters.make(name, rate, imu, self.config.GAINS)
         # a filter that learns the bias by itself wants a first value, but nobody has to wait for it
         learns = hasattr(self.filter, "resting")
         if not learns or not self._use_stored_bias():

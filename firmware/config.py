@@ -22,8 +22,9 @@ DEFAULTS = {
     "MAG_RATE_HZ": 100,
     # Corrections and biases, see calibration.py; made by `upright calibrate`.
     "CALIBRATION": "calibration.json",
-    # The filter by its name in filters.py, and its own arguments where its defaults are not wanted.
-    "FILTER": "mahony6",
+    # The filter by its name in filters.py; None: inertial9 where board.py has a magnetometer, else inertial6. And its
+    # own arguments, where its defaults are not wanted.
+    "FILTER": None,
     "GAINS": {},
     "EULER": "zyx",
     # Measure the gyro's bias at the start (the board has to lie still for a second).

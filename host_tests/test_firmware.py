@@ -240,7 +240,10 @@ def test_a_board_that_never_rests_goes_on_flagged(boot, tmp_path):
 
 
 def test_a_slow_chip_gives_enough_samples_for_its_bias(boot):
-    result, *_ = boot(seconds=5, board={"RATE": 50, "SENSOR_RATE_HZ": 50, "DRIVE": "data_ready"})
+    result, *_ = boot(
+        seconds=5,
+        board={"RATE": 50, "SENSOR_RATE_HZ": 50, "DRIVE": "data_ready", "FILTER": "mahony6"},
+    )
     healthy(result)
     assert result["bias_known"]
     assert result["missed"] == 0
@@ -258,7 +261,9 @@ def test_a_setting_with_a_slip_of_the_pen_is_refused(boot):
         ({"DRIVE": "telepathy"}, "DRIVE"),
         ({"FILTER": "magic"}, "unknown filter"),
         ({"ACCEL_RANGE_G": 3}, "accel_range_g"),
-        ({"GAINS": {"kp": 1000.0}}, "kp"),
+        ({"GAINS": {"kp": 0.5}}, "kp"),  # of another filter than the default
+        ({"FILTER": "mahony6", "GAINS": {"kp": 1000.0}}, "kp"),
+        ({"RATE": 50}, "rate"),
     ],
 )
 def test_a_setting_that_cannot_be_had_stops_the_start_with_a_reason(boot, settings, said):
