@@ -33,6 +33,11 @@ def pytest_generate_tests(metafunc):
         metafunc.parametrize("recorded", files or [none])
 
 
+def pytest_collection_modifyitems(items):
+    """The emulated board first: its tests share a board, so one worker has to run them, and that takes the longest."""
+    items.sort(key=lambda item: "test_rp2040" not in item.nodeid)
+
+
 @pytest.fixture(autouse=True)
 def fresh_machine():
     """Every test starts with a board that has just been powered, and nothing wired to it."""

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from upright import cli, device, flash, packages, paths, runtimes
 from upright import rp2040 as firmware
 
-pytestmark = [pytest.mark.xdist_group("rp2040"), pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.xdist_group("rp2040_flash"), pytest.mark.slow, pytest.mark.timeout(1800)]
 
 PICO = device.Facts("rp2", "Pico", (1, 26, 1), 6, 3, "armv6m", True, False, True, True, 0)
 OLD_CONFIG = b"import no_such_module"  # what the older installation has: it would not start
