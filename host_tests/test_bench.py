@@ -138,7 +138,10 @@ def test_the_integer_filter_takes_far_fewer_instructions_even_if_garbage_were_ne
 def figures(ratio):
     costs = dict.fromkeys(bench.PARTS, 100.0) | {"collected": 100.0 * ratio}
     return bench.Figures(
-        costs, {}, {"arm": costs}, ["microseconds on unix: not measured: no such port"]
+        instructions=costs,
+        allocated={"arm": costs},
+        cycles=costs,
+        not_here=["microseconds on unix: not measured: no such port"],
     )
 
 
@@ -154,6 +157,7 @@ def test_figures_are_put_between_their_marks_and_nothing_else_changes(tmp_path):
     assert "12.0" not in text
     assert "old" not in text
     assert "not measured: no such port" in text
+    assert "emulated RP2040" in text
     file.write_text("no place\n")
     with pytest.raises(ValueError, match="no place for the figures"):
         bench.save(figures(12), file)
