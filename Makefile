@@ -12,6 +12,7 @@ demo: setup  ## the firmware on the simulated board
 	@$(VENV)/upright demo
 
 test: setup lint  ## everything, on every runtime that this machine can have
+	@$(PYTHON) tools/bootstrap.py --extras
 	@$(VENV)/upright runtimes
 	@$(VENV)/python -m pytest -n $(PARALLEL) --dist loadgroup $(PYTEST_ARGS)
 

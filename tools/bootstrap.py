@@ -1,7 +1,8 @@
 """Makes .venv with everything that the host side needs: `make setup`. Standard library only, no root needed.
 
 A Debian without python3-venv has no pip to put into a virtual environment: then the wheel of Debian's python3-pip-whl
-is fetched beside it, without touching the system.
+is fetched beside it, without touching the system. `make test` also wants what tests compare with ("extras"): where a
+package of these cannot be had, the tests that need it skip, each with its line.
 """
 
 import importlib.util
@@ -15,7 +16,10 @@ ROOT = Path(__file__).resolve().parents[1]
 VENV = ROOT / ".venv"
 STAMP = VENV / ".upright-setup"
 PYTHON = VENV / "bin" / "python"
-SOURCES = (ROOT / "pyproject.toml", ROOT / "tools" / "constraints.txt", Path(__file__))
+EXTRAS = VENV / ".upright-extras"
+CONSTRAINTS = ROOT / "tools" / "constraints.txt"
+SOURCES = (ROOT / "pyproject.toml", CONSTRAINTS, Path(__file__))
+INSTALL = ("install", "--disable-pip-version-check", "-c", str(CONSTRAINTS))
 
 
 def fail(message):
@@ -58,8 +62,7 @@ def make():
     if subprocess.run(venv if has_pip else [*venv, "--without-pip"]).returncode:
         fail("python3 -m venv failed, see above")
     print("setup: installing the host side's packages", flush=True)
-    install = ["install", "--disable-pip-version-check", "-c", str(ROOT / "tools/constraints.txt")]
-    install += ["-e", f"{ROOT}[test]"]
+    install = [*INSTALL, "-e", f"{ROOT}[test]"]
     with tempfile.TemporaryDirectory() as folder:
         pip = (
             [str(PYTHON), "-m", "pip"]
@@ -74,6 +77,23 @@ def make():
     print("setup: done; .venv/bin/upright --help", flush=True)
 
 
+def add_extras():
+    """Wheels only: none of this is worth a compiler."""
+    import tomllib
+
+    print("setup: installing what the tests compare with", flush=True)
+    pip = [str(PYTHON), "-m", "pip", *INSTALL, "--only-binary=:all:"]
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    for name in ("plot", "references", "baselines"):
+        # one after the other: what has no wheel here is not to take the others with it
+        for package in extras[name]:
+            if subprocess.run([*pip, package]).returncode:
+                print(f"setup: {package} cannot be had here; tests that need it skip", flush=True)
+    EXTRAS.write_text(stamp())
+
+
 if __name__ == "__main__":
     if not STAMP.exists() or STAMP.read_text() != stamp():
         make()
+    if "--extras" in sys.argv and (not EXTRAS.exists() or EXTRAS.read_text() != stamp()):
+        add_extras()
