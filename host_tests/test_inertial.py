@@ -334,6 +334,25 @@ def test_a_turntable_after_a_rest_is_not_taken_for_a_bias(history, rate, mag_eve
     assert np.abs(heading[minute:] - heading[:-minute]).max() < 0.5
 
 
+@pytest.mark.parametrize("rate, mag_every", PACES)
+def test_after_an_outage_in_a_turn_it_finds_itself_again_at_once(history, rate, mag_every):
+    """The sensor is gone for 1.5 s, and the body does not go on as it did; the filter could only coast."""
+
+    def stops(t):
+        return np.outer((t > 19) & (t < 20.2), (60, 40, 50.0))
+
+    rendered = scene(rate, 30, stops, mag_every=mag_every)
+    back = int(21.5 * rate)
+    rendered.counts[20 * rate : back, 10] = 2  # not fresh; not 0, which stands for fresh in a file
+    rendered.counts[20 * rate : back, :6] = rendered.counts[20 * rate - 1, :6]
+    inclination, heading = errors(history(rendered).q, rendered)
+    assert inclination[back - 1] > 30
+    assert inclination[back + rate // 2 :].max() < 2
+    assert np.abs(heading[back + 4 * rate :]).max() < 3
+    slow = errors(history(rendered, 9, False, 1, "outage=5").q, rendered)
+    assert slow[0][back + rate // 2] > 5
+
+
 def test_a_turntable_from_power_on_is_taken_for_one(history):
     """The known limit, and the twin of the test before."""
     rendered = scene(200, 20, lambda t: np.outer(t >= 0, (0, 0, 3.0)), bias_dps=(0, 0, 0))
@@ -510,6 +529,7 @@ def disturb(rng, filter, w):
     s[w["_MN"]] = n
     s[w["_SINCE"]] = rng.choice((0, 1, 15, 16))
     s[w["_HAVE"]] = rng.choice((0, 1, 2, 2, 2))
+    s[w["_GAP"]] = rng.choice((0, 0, s[w["_OUTAGE"]] - 1, s[w["_OUTAGE"]]))
     for name in ("_F", "_FR", "_FC"):
         put(name, [rng.randint(0, 464000000), rng.choice((-464000000, 464000000, 1000))])
     if rng.random() < 0.5:
@@ -685,8 +705,8 @@ def test_it_coasts_on_the_last_gyro_words_without_feedback():
     filter.angles(out)
     assert out[2] == pytest.approx(50000, abs=30)
     assert abs(out[0]) < 30 and abs(out[1]) < 30
-    # nothing but the attitude and its remainders has changed
-    assert list(filter.state)[15:] == before[15:]
+    # nothing but the attitude and its remainders has changed, and the time since the last sample
+    assert list(filter.state)[15 : kernels._GAP] == before[15 : kernels._GAP]
 
 
 def test_feedback_does_not_starve_when_every_other_sample_is_missing(history):

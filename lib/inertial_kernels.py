@@ -117,7 +117,9 @@ _PHASE = const(176)  # fresh steps of the block
 _BLOCK_MASK = const(177)  # steps of a block less 1
 _NINE = const(178)  # 1: use the magnetometer
 _HK_DOUBT = const(179)  # heading gain of a block where 1/information is 1, Q22
-WORDS = const(180)
+_GAP = const(180)  # steps since the last fresh sample
+_OUTAGE = const(181)  # steps without one that restart the ramps
+WORDS = const(182)
 
 _STILL_BIT = const(1)
 _NEAR_REFERENCE = const(2)

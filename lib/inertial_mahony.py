@@ -114,6 +114,8 @@ _N_END = const(175)
 _PHASE = const(176)
 _BLOCK_MASK = const(177)
 _NINE = const(178)
+_GAP = const(180)
+_OUTAGE = const(181)
 
 _BIAS_MAX = const(8192 * 256)  # 1/256 counts: 62 deg/s at +-250, 500 deg/s at +-2000 deg/s
 _W_MAX = const((1 << 31) - (1 << 16))  # 1 rad in Q31, less what fixmath.turn adds for rounding
@@ -159,6 +161,7 @@ class InertialMahony:
     reject_for      60     rejected for longer, a field counts half, 0..1000
     restart_rad     0.55   a heading error that a good field does not explain, 0.1..3.14
     restart_after   5      restarts the heading's ramp when it lasts this long, 0.5..100
+    outage          0.5    so long without a fresh sample restarts both ramps, 0.05..10
 
     A steady rotation from power-on on looks like a bias and is taken for one, up to bias_limit_dps. The first 1.5 s at
     rest settle it.
@@ -235,7 +238,7 @@ class InertialMahony:
         for first, n in ((_CE, 3), (_S, 5), (_X, 16), (_MS, 4), (_C, 3), (_U, 3)):
             for i in range(n):
                 s[first + i] = 0
-        for i in (_N, _LATE, _HN, _LOST, _SINCE, _J_MAG, _PUSH, _ZK):
+        for i in (_N, _LATE, _HN, _LOST, _SINCE, _J_MAG, _PUSH, _ZK, _GAP):
             s[i] = 0
         s[_S + 2] = self.accel_lsb_per_g << 14
         s[_OM] = 32768
@@ -355,7 +358,15 @@ class InertialMahony:
         z = (s[_O + 2] << k >> k) + o * gain
         w = (s[_OR + 2] << k >> k) + o * fine + s[_WR + 2]
         fresh = c[10] & 1
-        if fresh:
+        if fresh == 0:
+            if s[_GAP] < s[_OUTAGE]:
+                s[_GAP] += 1
+        else:
+            if s[_GAP]:
+                if s[_GAP] == s[_OUTAGE]:  # too long to know where it has turned
+                    s[_N] = 0
+                    s[_HN] = 0
+                s[_GAP] = 0
             s[_GS] = (s[_GS] << k >> k) + n
             s[_GS + 1] = (s[_GS + 1] << k >> k) + m
             s[_GS + 2] = (s[_GS + 2] << k >> k) + o
@@ -462,6 +473,7 @@ PARAMETERS = {
     "reject_for": (60, 0, 1000),
     "restart_rad": (0.55, 0.1, 3.14),
     "restart_after": (5, 0.5, 100),
+    "outage": (0.5, 0.05, 10),
 }
 
 
@@ -546,6 +558,7 @@ def _set_up(s, rate, gyro_scale, lsb, parameters):
     s[_RAMP] = ramp_q8
     s[_N_RAMP] = -(-(p["tau_tilt"] * num * 256 // (_MILLION * den) - 512) // ramp_q8)
     s[_N_LATE] = ratio(p["bias_after"] * num, _MILLION * den)
+    s[_OUTAGE] = max(1, ratio(p["outage"] * num, _MILLION * den))
     s[_N_END] = max(s[_N_RAMP], s[_N_LATE] + 1)
     while lsb << s[_NORM] < 1 << 14:
         s[_NORM] += 1

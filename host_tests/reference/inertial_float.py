@@ -40,6 +40,7 @@ DEFAULTS = {
     "reject_for": 60.0,
     "restart_rad": 0.55,
     "restart_after": 5.0,
+    "outage": 0.5,
 }
 REST_TAU = 0.25  # s
 FIELD_SMOOTH = 0.05  # s
@@ -125,7 +126,7 @@ class InertialFloat:
         self.x, self.y, self.z = [0.0] * 6, [0.0] * 6, [0.0] * 3
         self.zk = self.push = 0.0
         self.mag_sum = [0.0, 0.0, 0.0]
-        self.mag_n = self.since = self.j = 0
+        self.mag_n = self.since = self.j = self.gap = 0
 
     # -- one step
     def update(self, counts, decisions=None):
@@ -136,7 +137,11 @@ class InertialFloat:
             turn = [turn[i] + self.C[i] for i in range(3)]
         self.q = turned(self.q, turn)
         if not fresh:
+            self.gap += 1
             return
+        if self.gap >= int(self.p["outage"] / dt + 0.5):
+            self.n = self.heading_n = 0
+        self.gap = 0
         self.forced = decisions
         self.n += 1
         K = max(1 / self.p["tau_tilt"], 1 / (self.ramp_tilt * self.n * dt + 2 * dt))
