@@ -71,6 +71,10 @@ class MPU6050(MpuBase):
         out[1] = value
         self._i2c.writeto(self._address, out)
 
+    def _write_from(self, buffer):
+        """A burst: buffer[0] is the register, the others go into it and the next ones."""
+        self._i2c.writeto(self._address, buffer)
+
     # Set-up
 
     def _begin(self):

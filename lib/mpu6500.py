@@ -115,6 +115,16 @@ class MPU6500(MpuBase):
         finally:
             self._cs(1)
 
+    def _write_from(self, buffer):
+        """A burst: buffer[0] is the register, the others go into it and the next ones."""
+        if self._hz != self._slow_hz:
+            self._clock(self._slow_hz)
+        try:
+            self._cs(0)
+            self._spi.write(buffer)
+        finally:
+            self._cs(1)
+
     # What machine.SPI.init(baudrate=) does, by the ports' sources: stm32 (machine_spi.c, spi.c) leaves
     # polarity and phase alone and takes the next lower power-of-two part of the peripheral's clock
     # (84 MHz: 656 kHz for 1 MHz, 5.25 MHz for 10 MHz, 10.5 MHz for 20 MHz); it sets up pins and

@@ -83,8 +83,9 @@ class Motion:
         """Seconds of every row."""
         return np.arange(self.n) * self.rate[1] / self.rate[0]
 
-    def write(self, path, clocked=False):
-        """Write the `.imu` file that world.World reads."""
+    def write(self, path, clocked=False, truth=False):
+        """Write the `.imu` file that world.World reads; truth: with the true attitude of every row."""
+        attitudes = np.rint(self.q_true * 2**30).astype("<i4").tobytes() if truth else b""
         world.write_imu(
             path,
             self.counts.astype("<i2").tobytes(),
@@ -93,6 +94,8 @@ class Motion:
             self.accel_lsb_per_g,
             self.gyro_scale,
             clocked,
+            attitudes,
+            int(truth),
         )
 
 

@@ -8,6 +8,7 @@ FORMAT = "upright-imu"
 VERSION = 1
 WORDS = 11  # ax ay az gx gy gz mx my mz temp flags
 ROW_BYTES = 2 * WORDS
+TRUTH_BYTES = 16
 _HEADER_MAX = 1024  # bytes, the newline included
 
 
@@ -63,8 +64,10 @@ class World(_Clock):
     """A motion or a recorded trial replayed from an `.imu` file.
 
     The file is one line of JSON (see `header_line`), a newline, then `rows` rows of eleven
-    little-endian int16 in the order ax ay az gx gy gz mx my mz temp flags. The runtimes are all
-    little-endian and read it as it lies.
+    little-endian int16 in the order ax ay az gx gy gz mx my mz temp flags; then, where the header has
+    `truth_every`, the true attitude at every so many-th row from the first on: little-endian int32,
+    w x y z, Q30, sensor to earth (x north, y west, z up), all 0 where it is not known. The runtimes
+    are all little-endian and read it as it lies.
 
     rate              (num, den): rows per second
     n                 number of rows
@@ -91,6 +94,8 @@ class World(_Clock):
         self.accel_lsb_per_g = header["accel_lsb_per_g"]
         self.gyro_scale = tuple(header["gyro_scale"])
         self.name = header["name"]
+        self._truth_every = header.get("truth_every", 0)
+        self._truth = array("i", bytes(TRUTH_BYTES))
         self._row = array("h", bytes(ROW_BYTES))
         self._at = -1  # the row that _row holds
         self._next = -1  # the row at which the file stands
@@ -114,6 +119,18 @@ class World(_Clock):
             self._at = k
             self._next = k + 1
         return self._row
+
+    def truth(self, k):
+        """The newest known attitude at row k: an array('i') of w x y z in Q30, valid until the next call; or None."""
+        every = self._truth_every
+        if not every:
+            return None
+        k = min(max(k, 0), self.n - 1) // every
+        self._next = -1
+        self._file.seek(self._base + self.n * ROW_BYTES + k * TRUTH_BYTES)
+        if self._file.readinto(self._truth) != TRUTH_BYTES:
+            raise OSError(5)
+        return self._truth if any(self._truth) else None
 
     def load(self, k, out):
         """Copy row k into out[0..10], the caller's own array('h')."""
@@ -168,7 +185,7 @@ class StillWorld(_Clock):
         pass
 
 
-def header_line(name, rate, rows, accel_lsb_per_g, gyro_scale, clocked):
+def header_line(name, rate, rows, accel_lsb_per_g, gyro_scale, clocked, truth_every=0):
     """The first line of an `.imu` file as bytes, newline included. ValueError when too long."""
     fields = {
         "format": FORMAT,
@@ -180,24 +197,37 @@ def header_line(name, rate, rows, accel_lsb_per_g, gyro_scale, clocked):
         "gyro_scale": [int(v) for v in gyro_scale],
         "clocked": bool(clocked),
     }
+    if truth_every:
+        fields["truth_every"] = int(truth_every)
     line = json.dumps(fields).encode() + b"\n"
     if len(line) > _HEADER_MAX:
         raise _error("an .imu header of", len(line), "bytes; at most", _HEADER_MAX, "fit")
     return line
 
 
-def write_imu(path, data, name, rate, accel_lsb_per_g, gyro_scale, clocked):
+def write_imu(
+    path, data, name, rate, accel_lsb_per_g, gyro_scale, clocked, truth=b"", truth_every=0
+):
     """Write an `.imu` file. data: bytes, 22 a row, little-endian int16 in the counts order.
 
-    Raises ValueError when data are not whole rows or there is none, OSError as `open` does.
+    truth: bytes, 16 for every truth_every-th row from the first on, little-endian int32, w x y z in
+    Q30; all 0 where it is not known. Raises ValueError when data are not whole rows or there is none,
+    and for a truth of another length; OSError as `open` does.
     """
     rows = len(data) // ROW_BYTES
     if rows < 1 or len(data) != rows * ROW_BYTES:
         raise _error(len(data), "bytes are not whole rows of", ROW_BYTES, "bytes")
-    line = header_line(name, rate, rows, accel_lsb_per_g, gyro_scale, clocked)
+    if len(truth) != _truth_bytes(rows, truth_every):
+        raise _error(len(truth), "bytes of truth for", rows, "rows, every", truth_every)
+    line = header_line(name, rate, rows, accel_lsb_per_g, gyro_scale, clocked, truth_every)
     with open(path, "wb") as out:
         out.write(line)
         out.write(data)
+        out.write(truth)
+
+
+def _truth_bytes(rows, every):
+    return (rows + every - 1) // every * TRUTH_BYTES if every else 0
 
 
 def _error(*words):
@@ -217,6 +247,7 @@ def _read_header(file, path):
     if not _complete(fields):
         raise _error(path, "lacks a field in its .imu header or has a wrong one:", fields)
     expected = end + 1 + fields["rows"] * ROW_BYTES
+    expected += _truth_bytes(fields["rows"], fields.get("truth_every", 0))
     found = file.seek(0, 2)
     if found != expected:
         what = "is truncated" if found < expected else "is too long"
@@ -246,6 +277,7 @@ def _complete(fields):
         and _positive(fields.get("accel_lsb_per_g"))
         and isinstance(fields.get("clocked"), bool)
         and isinstance(fields.get("name"), str)
+        and _positive(fields.get("truth_every", 1))
     )
 
 

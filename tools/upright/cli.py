@@ -12,12 +12,15 @@ from upright import (
     __version__,
     bench,
     calibrate,
+    compare,
+    dmp,
     doctor,
     flash,
     packages,
     rp2040,
     runtimes,
     score,
+    tune,
     wiring,
 )
 
@@ -90,6 +93,9 @@ flash.register(app)
 doctor.register(app)
 wiring.register(app)
 score.register(app)
+compare.register(app)
+dmp.register(app)
+tune.register(app)
 
 _RUNTIME = "cpython, unix, unix32 or arm"
 
@@ -124,6 +130,9 @@ def demo_command(
     speed: float = typer.Option(None, min=0, help="Times real time; 0: as fast as it goes."),
     png: Path = typer.Option(None, help="Save the display's last picture."),
     gif: Path = typer.Option(None, help="Save all that the display showed as an animation."),
+    dmp_image: Path = typer.Option(
+        None, exists=True, dir_okay=False, help="The DMP's image for dmp6 (a stand-in)."
+    ),
     runtime: str = typer.Option(None, help=f"{_RUNTIME} (default: unix where it can be had)."),
 ):
     """Boot the firmware on the simulated board: MPU6050, filter in a hard timer tick, OLED; and how far off it was."""
@@ -139,6 +148,9 @@ def demo_command(
             if trial
             else demo.motion_source(motion, seconds, board)
         )
+        if trial and "dmp6" in names:
+            raise ValueError("dmp6 samples by a clock of its own: it cannot follow a --trial")
+        source.dmp_image = dmp_image
         runtime = runtime or simulate.best_runtime()
         outcomes = []
         for name in names:

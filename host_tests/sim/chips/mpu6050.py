@@ -7,6 +7,7 @@ from micropython import const
 
 from chips.aux_master import AuxMaster
 from chips.common import PacketFifo
+from chips.dmp import Dmp
 from chips.mpu_sensors import GYRO_START_US, Sensors
 
 _SMPLRT_DIV = const(0x19)
@@ -24,6 +25,8 @@ _MST_DELAY_CTRL = const(0x67)
 _SIGNAL_PATH_RESET = const(0x68)
 _USER_CTRL = const(0x6A)
 _PWR_MGMT_1 = const(0x6B)
+_BANK_SEL = const(0x6D)
+_MEM_START_ADDR = const(0x6E)
 _MEM_R_W = const(0x6F)
 _FIFO_COUNTH = const(0x72)
 _FIFO_COUNTL = const(0x73)
@@ -56,12 +59,13 @@ class MPU6050Chip(Sensors):
     clock_ppm       error of the clock when the gyro PLL drives it (PS 7.15: within 1 %)
     oscillator_ppm  the same for the internal oscillator, which runs after reset
     fifo_byte_us    time between two bytes of a packet on its way into the FIFO; 0: all at once
+    dmp_dead        how its DMP is broken, see Dmp; that of 0x98 is "silent" unless another fault is named
 
     Its attributes: aux, the list of chip models on its auxiliary bus; master, the AuxMaster that
-    speaks with them; misuse and log, see Faults.
+    speaks with them; dmp, the Dmp; misuse and log, see Faults.
 
     The digital low-pass filter sets rates only: it does not filter what the world gives. Not
-    simulated: I2C bypass, cycle mode, motion interrupts, the DMP, FSYNC, offset registers.
+    simulated: I2C bypass, cycle mode, motion interrupts, the DMP's interrupt, FSYNC, offset registers.
     """
 
     # The datasheets say only what a driver must allow, 100 ms; this is less, to be changed at will
@@ -77,6 +81,7 @@ class MPU6050Chip(Sensors):
         clock_ppm=0,
         oscillator_ppm=20_000,
         fifo_byte_us=0,
+        dmp_dead=None,
         now=0,
     ):
         self._init_faults(now)
@@ -89,6 +94,9 @@ class MPU6050Chip(Sensors):
         self.int_level = 0
         self.master = AuxMaster(self)
         self.aux = self.master.slaves
+        # RM-MPU-6500A: FIFO and DMP share 4 KB; the 6050 has 12 banks (InvenSense's motion driver 6.12)
+        fault = dmp_dead or ("silent" if who_am_i == 0x98 else None)
+        self.dmp = Dmp(self, 4096 - 512 if self.family_6500 else 3072, fault)
         self._identity = who_am_i
         self._ppm = (oscillator_ppm, clock_ppm)
         self._reset_until = 0
@@ -131,6 +139,7 @@ class MPU6050Chip(Sensors):
         self.fifo.clear()
         self.master.stop(self._now, None)
         self.master.reset()
+        self.dmp.reset()
         self._restart_clock()
         self._wake_us = self._now - (0 if self.awake else GYRO_START_US)
         self._drive_int()
@@ -228,11 +237,12 @@ class MPU6050Chip(Sensors):
         r = self._registers
         master = self.master
         fifo_on = r[_USER_CTRL] & 0x40 and (r[_FIFO_EN] or r[_I2C_MST_CTRL] & 0x20)
-        if fifo_on or master.active:
+        dmp = self.dmp
+        if fifo_on or master.active or dmp.running:
             slaves = fifo_on and master.active and (r[_FIFO_EN] & 7 or r[_I2C_MST_CTRL] & 0x20)
             first = self._done + 1
             jump_at = first + (2 if master.active else 0)
-            jump = self._idle_samples(total - jump_at + 1, fifo_on)
+            jump = 0 if dmp.running else self._idle_samples(total - jump_at + 1, fifo_on)
             k = first
             while k <= total:
                 if k == jump_at and jump:
@@ -242,6 +252,12 @@ class MPU6050Chip(Sensors):
                 self._sample_us = self._time(k)
                 self._sample_row = self._row_index(self._sample_us, k)
                 packet = None
+                if dmp.running:
+                    self._words = self._measure()
+                    packet = dmp.sample(self._sample_row)
+                    if packet and r[_USER_CTRL] & 0x40:
+                        self._queue_packet(self._sample_us, packet)
+                    packet = None
                 if fifo_on:
                     self._words = self._measure()
                     packet = self._packet()
@@ -385,6 +401,8 @@ class MPU6050Chip(Sensors):
             value = self.fifo.shadow >> 8
         elif register == _FIFO_COUNTL:
             value = self.fifo.shadow & 0xFF
+        elif register == _MEM_R_W:
+            value = self.dmp.read()
         elif register == _I2C_MST_STATUS:
             value = self.master.status
             self.master.status = 0  # RM 4.13: reading clears it
@@ -414,6 +432,9 @@ class MPU6050Chip(Sensors):
             if self.fifo.push(value, self._fifo_stops()):
                 self._fifo_overflow()
             return
+        if register == _MEM_R_W:
+            self.dmp.write(value)
+            return
         self._settle_words()
         self._quiet_until = 0
         old = r[register]
@@ -422,7 +443,9 @@ class MPU6050Chip(Sensors):
         elif register == _SIGNAL_PATH_RESET:
             value = 0  # RM 4.26: resets the analogue paths only; the registers stay
         r[register] = value
-        if register == _PWR_MGMT_1:
+        if _BANK_SEL <= register <= _MEM_START_ADDR:
+            self.dmp.point(register, value)
+        elif register == _PWR_MGMT_1:
             if old & 0x40 and not value & 0x40:
                 self._wake_us = self._now
             if (old ^ value) & 0x47:
@@ -456,7 +479,8 @@ class MPU6050Chip(Sensors):
         if value & 0x01:  # SIG_COND_RESET clears the sensor registers
             self._words = [0] * 7
             master.clear_data()
-        return value & ~0x07  # the reset bits clear themselves
+        self.dmp.control(value)
+        return value & ~0x0F  # the reset bits clear themselves
 
     def _i2c_if_dis(self, bit):
         if bit:
