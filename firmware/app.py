@@ -4,6 +4,7 @@
 import time
 from array import array
 
+import bias
 import calibration
 import config
 import filters
@@ -17,29 +18,15 @@ _FRAME_MS = const(100)
 _RATE_MS = const(1000)
 _LOST_MS = const(300)  # without a fresh sample the attitude is only carried on
 _RETRY_MS = const(1000)
-_KEEP_AFTER_S = const(
-    10
-)  # so long at rest, and what the filter has learnt of the bias is worth keeping
-_KEEP_EVERY_S = const(600)  # at least between two writes of the flash
-_KEEP_MDPS = const(20)  # and a change
 _HEADING_MS = const(300)  # the first magnetometer sample is waited for as long
 _GUARD_HZ = const(50)
-
-# At rest: what the gyro and accelerometer of an MPU6050 may move in a window, and how far a bias may lie (PS 6.1:
-# zero-rate output +-20 deg/s).
-_REST_GYRO_DPS = const(3)
-_REST_ACCEL_MG = const(120)
-_BIAS_MOST_DPS = const(20)
-_REST_WINDOW_MS = const(1000)
-_REST_TRIES = const(4)
-_REST_READS_HZ = const(200)  # at least, with the slowest bus
 
 
 class App:
     """One board's application: run() never returns.
 
     tick, filter, imu, mag, calibration, display, ticker are there once start() is through (mag is None on a board
-    without a magnetometer); bias_known says whether the gyro's bias was measured.
+    without a magnetometer); bias.known says whether the gyro's bias is.
     """
 
     def __init__(self, board):
@@ -50,19 +37,18 @@ class App:
         self._own_mag = None  # the same, where it is read by itself and not with the IMU's sample
         self.calibration = None
         self.filter = None
+        self._in_chip = False  # sensor and filter are one object
         self.tick = None
         self.ticker = None
         self.guard = None
         self.display = None
-        self.bias_known = False
+        self.bias = bias.Bias(self)
         self.angles = array("i", [0] * 3)  # roll, pitch, yaw in millidegrees
         self.rate_hz = 0
         self._snapshot = array("i", [0] * ticks.SNAPSHOT_WORDS)
-        self._bias = array("i", [0] * 3)
+        self._bias_mdps = array("i", [0] * 3)
         self._status = array("i", [-1] * pages.STATUS_WORDS)
-        self._rested_s = 0
-        self._kept_s = _KEEP_EVERY_S  # since the last write
-        self._notes = []  # what start-up could not do, for the display
+        self.notes = []  # what start-up could not do, for the display
         self._page = 0
         self._pages = None
         now = time.ticks_ms()
@@ -88,6 +74,11 @@ class App:
         board = self.board
         print("upright on", board.NAME)
         self._open_display()
+        name = self.config.FILTER
+        if name is None:
+            name = "inertial9" if hasattr(board, "magnetometer") else "inertial6"
+        filters.check(name)
+        self._in_chip = name in filters.HARDWARE
         self.say("Upright", board.NAME, "looking for", "the sensor")
         while not self._open_sensor():
             time.sleep_ms(_RETRY_MS)
@@ -96,19 +87,16 @@ class App:
         if self.config.DRIVE != "timer" and not self.config.EXTERNAL_CLOCK:
             # every packet or data-ready edge is one step, so the chip's rate is the rate
             rate = imu.sample_rate
-        self._open_magnetometer()
+        if not self._in_chip:
+            self._open_magnetometer()
         self._load_calibration()
-        name = self.config.FILTER or ("inertial6" if self.mag is None else "inertial9")
-        self.filter = filters.make(name, rate, imu, self.config.GAINS)
-        # a filter that learns the bias by itself wants a first value, but nobody has to wait for it
-        learns = hasattr(self.filter, "resting")
-        if not learns or not self._use_stored_bias():
-            if self.config.MEASURE_BIAS:
-                self.say("Keep still", "measuring the", "gyro's bias", *self._notes)
-                self.bias_known = self._measure_bias(1 if learns else _REST_TRIES)
-            if not self.bias_known and not learns and not self._use_stored_bias():
-                print("bias: going on without (marked B? on the display)")
-        self._seed()
+        if self._in_chip:
+            self.filter = imu
+            self.bias.known = True  # it takes care of that itself
+        else:
+            self.filter = filters.make(name, rate, imu, self.config.GAINS)
+            self.bias.find()
+            self._seed()
         self._start_tick(rate)
         print(
             "tick: %s, every %d us, %s drive"
@@ -129,6 +117,11 @@ class App:
         board = self.board
         try:
             imu = board.sensor()
+            if self._in_chip:
+                imu = filters.make_hardware(self.config.FILTER, imu, self.config)
+                imu.configure()
+                print("dmp: image %s, %d bytes" % (imu.version, imu.image.size))
+                return self._found(imu)
             imu.configure(
                 accel_range_g=self.config.ACCEL_RANGE_G,
                 gyro_range_dps=self.config.GYRO_RANGE_DPS,
@@ -139,6 +132,9 @@ class App:
             print("sensor:", why)
             self.say("No sensor", str(why))
             return False
+        return self._found(imu)
+
+    def _found(self, imu):
         print(
             "sensor: %s, %d/%d Hz, +-%d g, +-%d deg/s"
             % ((imu.chip,) + imu.sample_rate + (imu.accel_range_g, imu.gyro_range_dps))
@@ -164,7 +160,7 @@ class App:
             print("magnetometer: %s, %d/%d Hz" % ((mag.chip,) + mag.sample_rate))
         except OSError as why:
             print("magnetometer:", why)
-            self._notes.append("no magnetometer")
+            self.notes.append("no magnetometer")
             mag.attach()  # should it answer yet, the tick finds it and sets it up
 
     def _load_calibration(self):
@@ -177,14 +173,14 @@ class App:
             print("calibration:", config.CALIBRATION)
         except calibration.CalibrationError as why:
             print("calibration: %s; going on with defaults" % why)
-            self._notes.append(why.title)
+            self.notes.append(why.title)
 
     @property
     def counts(self):
         """The newest sample as the filter gets it: calibrated, in the body's frame."""
         return self.imu.counts if self.calibration.identity else self.calibration.counts
 
-    def _sample(self):
+    def sample(self):
         """Read a sample while no tick does -> its flags."""
         flags = self.imu.read()
         if self._own_mag is not None:
@@ -193,95 +189,13 @@ class App:
             self.calibration.apply(self.imu.counts)
         return flags
 
-    def _use_stored_bias(self):
-        """The gyro's bias of the calibration file -> False when there is none."""
-        bias = self.calibration.gyro_bias()
-        if bias is None:
-            return False
-        self.filter.set_bias(*bias)
-        self.bias_known = True
-        print("bias: from", self.config.CALIBRATION)
-        return True
-
-    def _keep_bias(self):
-        """Once a second: what the filter has learnt of the bias into the calibration file, at rest and seldom, since a
-        write of the flash holds up everything for some hundredths of a second on most boards."""
-        self._kept_s += 1
-        if not self.filter.resting:
-            self._rested_s = 0
-            return
-        self.bias_known = True
-        self._rested_s += 1
-        if self._rested_s != _KEEP_AFTER_S or self._kept_s < _KEEP_EVERY_S:
-            return
-        self.filter.bias(self._bias)
-        num, den = self.imu.gyro_scale
-        known = self.calibration.gyro_bias()
-        if known is not None:
-            change = max([abs(self._bias[i] - known[i]) for i in range(3)])
-            if change * 1000 * den < _KEEP_MDPS * 256 * num:
-                return
-        self._kept_s = 0
-        try:
-            x, y, z = self._bias
-            self.calibration.save_gyro_bias(
-                self.config.CALIBRATION, x, y, z, self.imu.chip, self.board.NAME
-            )
-            print("bias: kept in", self.config.CALIBRATION)
-        except (OSError, ValueError) as why:
-            print("bias: not kept:", why)
-
-    def _measure_bias(self, tries):
-        """Mean of the gyro over a window at rest -> True; False when it never rested."""
-        imu = self.imu
-        counts = self.counts
-        num, den = imu.gyro_scale
-        gyro_most = _REST_GYRO_DPS * num // den
-        bias_most = _BIAS_MOST_DPS * num // den
-        accel_most = imu.accel_lsb_per_g * _REST_ACCEL_MG // 1000
-        rate_num, rate_den = self.config.RATE if self.config.EXTERNAL_CLOCK else imu.sample_rate
-        # half of what the chip and this loop can give
-        enough = min(rate_num // rate_den, _REST_READS_HZ) * _REST_WINDOW_MS // 2000
-        for k in range(tries):
-            low = array("h", [32767] * 6)
-            high = array("h", [-32768] * 6)
-            total = [0] * 6
-            n = 0
-            start = time.ticks_ms()
-            while time.ticks_diff(time.ticks_ms(), start) < _REST_WINDOW_MS:
-                if self._sample() & 1:
-                    n += 1
-                    for i in range(6):
-                        c = counts[i]
-                        total[i] += c
-                        low[i] = min(low[i], c)
-                        high[i] = max(high[i], c)
-                time.sleep_ms(2)
-            if n < enough:
-                print("bias: only %d samples in %d ms" % (n, _REST_WINDOW_MS))
-                continue
-            spread = [high[i] - low[i] for i in range(6)]
-            mean = [(2 * 256 * t + n) // (2 * n) for t in total[3:]]  # in 1/256 count
-            if (
-                max(spread[:3]) <= accel_most
-                and max(spread[3:]) <= gyro_most
-                and max(abs(m) for m in mean) <= 256 * bias_most
-            ):
-                self.filter.set_bias(*mean)
-                print("bias: %s mdeg/s" % ([m * 1000 * den // (256 * num) for m in mean],))
-                return True
-            if k + 1 < tries:
-                self.say("Keep still", "it moves;", "trying again", *self._notes)
-        print("bias: never at rest")
-        return False
-
     def _seed(self):
         """The attitude from a first sample, heading included where a magnetometer has one; from level when none comes
         (the tick's feedback does the rest)."""
         start = time.ticks_ms()
         passed = 0
         while passed < 2 * _HEADING_MS:
-            flags = self._sample()
+            flags = self.sample()
             passed = time.ticks_diff(time.ticks_ms(), start)
             # one sample in several has the magnetometer's: none may go by unread
             ready = self.mag is None or self.filter.AXES < 9 or flags & 2 or passed > _HEADING_MS
@@ -292,7 +206,7 @@ class App:
 
     def _start_tick(self, rate):
         board = self.board
-        num, den = rate
+        num, den = self.rate = rate
         self.rate_hz = (2 * num + den) // (2 * den)  # until the first second has been counted
         self._rate_at = time.ticks_ms()
         self._period_us = (2000000 * den + num) // (2 * num)
@@ -345,7 +259,9 @@ class App:
             self._rate_steps = tick.steps
             self._report()
             if self.config.KEEP_BIAS and hasattr(self.filter, "resting"):
-                self._keep_bias()
+                self.bias.keep()
+            if self._in_chip and self.imu.needs_reload:
+                self._reload()
         if time.ticks_diff(now, self._frame_at) >= _FRAME_MS:
             self._frame_at = now
             self.update_angles()
@@ -356,6 +272,17 @@ class App:
         if self.tick.snapshot(self._snapshot):
             fixmath.euler(self._snapshot, self.angles, self.config.EULER)
 
+    def _reload(self):
+        """The chip has lost its program. To load it takes the bus for most of a second, so the tick has to stop."""
+        self.ticker.stop()
+        try:
+            self.imu.reload()
+            print("dmp: loaded again")
+        except OSError as why:
+            print("dmp:", why)
+        self.tick.resume()
+        self.ticker = self.board.make_tick(self.rate, self.tick.on_sample)
+
     def faults(self):
         """All that went wrong since the start, and was survived."""
         imu, tick = self.imu, self.tick
@@ -364,6 +291,8 @@ class App:
             n += self.display.errors
         if self.mag is not None:
             n += self.mag.errors + self.mag.resets
+        if self._in_chip:
+            n += imu.misaligned + imu.stalls
         return n
 
     def _report(self):
@@ -380,7 +309,7 @@ class App:
         if seconds and time.ticks_diff(now, self._page_at) >= seconds * 1000:
             self._page_at = now
             self._page = (self._page + 1) % pages.COUNT
-        flags = 0 if self.bias_known else pages.BIAS_UNKNOWN
+        flags = 0 if self.bias.known else pages.BIAS_UNKNOWN
         if time.ticks_diff(now, self._fresh_at) >= _LOST_MS:
             flags |= pages.SENSOR_LOST
         mag_lost = self.mag is None or time.ticks_diff(now, self._mag_at) >= _LOST_MS
@@ -402,9 +331,9 @@ class App:
     def _fill_status(self, mag_lost):
         """What the status page shows, as far as this filter tells it."""
         filter, status = self.filter, self._status
-        filter.bias_mdps(self._bias)
+        filter.bias_mdps(self._bias_mdps)
         for i in range(3):
-            status[pages.BIAS + i] = self._bias[i]
+            status[pages.BIAS + i] = self._bias_mdps[i]
         if hasattr(filter, "resting"):
             status[pages.REST] = 1 if filter.resting else 0
             status[pages.DOUBT] = filter.heading_uncertainty_mdeg

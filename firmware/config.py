@@ -27,6 +27,10 @@ DEFAULTS = {
     "FILTER": None,
     "GAINS": {},
     "EULER": "zyx",
+    # For the filter "dmp6": the file with the DMP's image, which the user has to have, and its SHA-256 where the
+    # library does not know it; `upright dmp check FILE` shows it.
+    "DMP_IMAGE": "dmp.bin",
+    "DMP_SHA256": None,
     # Measure the gyro's bias at the start (the board has to lie still for a second).
     "MEASURE_BIAS": True,
     # A filter that learns the gyro's bias: write it into the calibration file when the board rests, for the next start.

@@ -7,7 +7,21 @@ FILTERS = {
     "inertial6": ("inertial_mahony", "Inertial6"),
     "inertial9": ("inertial_mahony", "Inertial9"),
     "inertial9-lite": ("inertial_mahony", "Inertial9Lite"),
+    "euler6": ("complementary", "Euler6"),
+    "kalman6": ("kalman", "Kalman6"),
+    "quaternion-kalman6": ("quaternion_kalman", "QuaternionKalman6"),
+    "quaternion-kalman9": ("quaternion_kalman", "QuaternionKalman9"),
+    "dmp6": ("mpu_dmp", "MpuDmp"),
 }
+
+# These are computed by the sensor itself: driver and filter are one object, so no samples can be handed to them.
+HARDWARE = ("dmp6",)
+
+
+def check(name):
+    """Raise ValueError for a name that no filter has."""
+    if name not in FILTERS:
+        raise ValueError("unknown filter %r; there are %s" % (name, ", ".join(sorted(FILTERS))))
 
 
 def make(name, rate, imu, gains):
@@ -16,11 +30,35 @@ def make(name, rate, imu, gains):
     gains: dict of the filter's own keyword arguments, {} for its defaults. Raises ValueError for an unknown name, and
     for what the filter does not take.
     """
-    if name not in FILTERS:
-        raise ValueError("unknown filter %r; there are %s" % (name, ", ".join(sorted(FILTERS))))
-    module, kind = FILTERS[name]
-    kind = getattr(__import__(module), kind)
+    check(name)
+    if name in HARDWARE:
+        raise ValueError("%s is computed in the sensor: no samples can be handed to it" % name)
+    kind = _class(name)
     try:
         return kind(rate, imu.gyro_scale, imu.accel_lsb_per_g, **gains)
     except TypeError as why:
         raise ValueError("%s with %r: %s" % (name, gains, why))
+
+
+def make_hardware(name, imu, config):
+    """Build a filter of HARDWARE on the driver `imu`, by config's RATE, DMP_IMAGE, DMP_SHA256 and IMU_AXES.
+
+    It takes the place of the driver, and it is the filter. Raises OSError for an image that is absent or not the one
+    that is known, ValueError for settings that it cannot keep.
+    """
+    num, den = config.RATE
+    if num % den or config.DRIVE != "timer":
+        raise ValueError('with %s DRIVE is "timer" and RATE a whole number' % name)
+    more = {"known": (config.DMP_SHA256,)} if config.DMP_SHA256 else {}
+    return _class(name)(imu, config.DMP_IMAGE, num // den, axes=config.IMU_AXES, **more)
+
+
+def _class(name):
+    module, kind = FILTERS[name]
+    try:
+        return getattr(__import__(module), kind)
+    except ImportError:
+        raise ValueError(
+            "%s.py is not on this board: install the firmware again with FILTER = %r"
+            % (module, name)
+        )

@@ -230,6 +230,11 @@ class Tick:
             self._imu.health()
 
     # -- for the main program
+    def resume(self):
+        """Before the ticks go on after they were stopped: that time is not one of ticks that never came."""
+        self._started = False
+        self._made_up = 0
+
     @property
     def steps(self):
         """Steps of the filter, ticks made up for not counted."""

@@ -24,6 +24,7 @@ CONFIG = {
     "mag": True,
     "display": True,
     "who_am_i": None,  # another identity for the IMU
+    "dmp_image": None,  # a file that the IMU's DMP runs when it is loaded
     "irq_cost_us": 0,  # what the tick's code takes, beside its bus time
     "twin": None,  # "main_writes_shared_bus": what the firmware must not do, to show that it would be noticed
     "faults": [],  # [at_us, "imu", "mag", "display" or "bus", method, arguments...]: what goes wrong, and when
@@ -118,6 +119,9 @@ def main():
     for name, value in config["board"].items():
         setattr(board, name, tuple(value) if isinstance(value, list) else value)
     parts = boards.wire(config["board_name"], board, world, config)
+    if config["dmp_image"]:
+        with open(config["dmp_image"], "rb") as file:
+            parts.imu.dmp.images.append(file.read())
     bus = parts.buses[0]
     faulty = {"imu": parts.imu, "mag": parts.mag, "display": parts.display, "bus": bus}
     kernel.add_source(Faults(config["faults"], faulty))
@@ -192,7 +196,7 @@ def finish(app, recorder, parts):
         result["errors"] = imu.errors
         result["resets"] = imu.resets
         result["fifo_overflows"] = imu.fifo_overflows
-        result["bias_known"] = app.bias_known
+        result["bias_known"] = app.bias.known
         result["angles_mdeg"] = list(app.angles)
         result["ticker"] = app.ticker.what
         result["display_errors"] = app.display.errors if app.display else None

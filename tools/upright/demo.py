@@ -1,5 +1,7 @@
 """The demo: boots the firmware on the simulated board and shows its display, its console, and how far off it was."""
 
+import hashlib
+import random
 import sys
 import tempfile
 import time
@@ -34,6 +36,7 @@ class Source:
     movement: np.ndarray | None = None
     board_name: str = "sim"
     board: dict = field(default_factory=dict)
+    dmp_image: Path | None = None  # of the filter dmp6; None: a stand-in
 
 
 def boards() -> list[str]:
@@ -50,9 +53,11 @@ def motion_source(name: str, seconds: float | None, board_name: str = "sim") -> 
     if name not in motions.MOTIONS:
         raise ValueError(f"unknown motion {name!r}; there are {', '.join(motions.MOTIONS)}")
     motion = motions.render(name, rate=(WORLD_HZ, 1), seconds=seconds)
-    return Source(
-        name, seconds, motion.write, motion.rate, motion.t, motion.q_true, board_name=board_name
-    )
+
+    def write(path):
+        motion.write(path, truth=True)  # which a simulated DMP shows
+
+    return Source(name, seconds, write, motion.rate, motion.t, motion.q_true, board_name=board_name)
 
 
 def trial_source(path: Path, seconds: float | None, board_name: str = "sim") -> Source:
@@ -99,17 +104,29 @@ def run(source: Source, runtime: str, on_frame=None, on_console=None, **config) 
     with tempfile.TemporaryDirectory() as folder:
         world, out = Path(folder) / "world.imu", Path(folder) / "steps"
         source.write(world)
+        board = source.board
+        if board.get("FILTER") == "dmp6":
+            image = source.dmp_image or _stand_in(Path(folder) / "dmp.bin")
+            digest = hashlib.sha256(image.read_bytes()).hexdigest()
+            board = board | {"DMP_IMAGE": str(image.resolve()), "DMP_SHA256": digest}
+            config["dmp_image"] = board["DMP_IMAGE"]
         config = {
             "world": str(world),
             "seconds": source.seconds,
             "frame_ms": FRAME_MS,
             "out": str(out),
             "board_name": source.board_name,
-            "board": source.board,
+            "board": board,
         } | config
         result = simulate.run(runtime, simulate.FIRMWARE, config, event)
         rows, q29 = simulate.read_steps(out)
     return Outcome(result, _score(source, rows, q29), frames, lines, runtime)
+
+
+def _stand_in(path: Path) -> Path:
+    """A file that could be a DMP's image: the simulated DMP runs what it is told to."""
+    path.write_bytes(random.Random(6050).randbytes(3062))
+    return path
 
 
 def _score(source: Source, rows, q29):
@@ -145,6 +162,10 @@ def summary(outcome: Outcome) -> list[str]:
         )
     elif s:
         lines.append("no truth in this span: nothing to compare with")
+    if r["filter"] == "dmp6":
+        lines.append(
+            "   (a simulated DMP shows the true motion: this tells of the driver, not of the chip's program)"
+        )
     lines.append(
         f"ticks {r['steps']} ({r['fresh']} with a fresh sample), missed {r['missed']}, exceptions {r['crashes']},"
         f" bus errors {r['errors']}, transfers cut {r['cuts']}"
