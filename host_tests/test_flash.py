@@ -211,11 +211,28 @@ def test_facts_of_a_board_and_files_that_it_can_load(board):
     facts.architecture = "armv6m"
     files = flash.board_files("pico", facts)
     assert files["board.py"] == (paths.BOARDS / "pico" / "board.py").read_bytes()
-    assert files["lib/mahony.mpy"][:2] == b"M\x06"
-    assert "lib/mahony.py" not in files
+    assert files["lib/fixmath.mpy"][:2] == b"M\x06"
+    assert "lib/fixmath.py" not in files
     assert "main.py" in files
+    # of the filters the one that it runs, and that of a board.py that may stay
+    assert "lib/inertial_mahony.mpy" in files and "lib/mahony.mpy" not in files
+    assert "lib/mahony.mpy" in flash.board_files("pico", facts, own='FILTER = "mahony6"\n')
     with pytest.raises(device.DeviceError, match="unknown board"):
         flash.board_files("abacus", facts)
+
+
+@pytest.mark.parametrize("board_py, has, lacks", [
+    ("", {"inertial_mahony", "inertial_kernels"}, {"mahony", "ist8310", "mpu_dmp", "kalman"}),
+    ('FILTER = "kalman6"', {"kalman", "euler_kernels", "fixmath"}, {"inertial_mahony", "mpu_dmp"}),
+    ('FILTER = "dmp6"\nimport mpu6500', {"mpu_dmp", "mpu_dmp_image", "mpu6500"}, {"mahony"}),
+    ("FILTER = None\ndef f():\n    import ist8310", {"inertial_mahony", "ist8310", "auxiliary_bus"}, {"mahony"}),
+    ("import os\nFILTER = os.environ", {"inertial_mahony", "mahony", "quaternion_kalman", "mpu_dmp"}, {"ist8310"}),
+])  # fmt: skip
+def test_a_board_gets_the_library_that_it_needs(board_py, has, lacks):
+    needed = flash.library(board_py)
+    assert has <= needed and not lacks & needed
+    assert {"fixmath", "calibration", "ssd1306"} <= needed
+    assert all((paths.LIB / f"{module}.py").exists() for module in needed)
 
 
 def test_an_old_micropython_without_viper_is_refused_with_both_reasons():

@@ -29,7 +29,7 @@ def examine(transport, axes: bool, south: bool, on_line) -> list[str]:
     for name in ("board.py", "doctor.mpy"):
         if not transport.fs_exists(name) and not transport.fs_exists(name.replace(".mpy", ".py")):
             raise device.DeviceError(f"{name} is not on the board: `upright flash BOARD` first")
-    wanted = flash.board_platform_of(transport.fs_readfile("board.py").decode())
+    wanted = flash.setting(transport.fs_readfile("board.py").decode(), "PLATFORM")
     if wanted and wanted != found.platform:
         problems.append(f"board.py is for the port {wanted!r}, this is {found.platform!r}")
     call = f"doctor.axes(board, {south})" if axes else "doctor.report(board)"

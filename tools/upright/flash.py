@@ -18,10 +18,11 @@ from mpremote.transport import TransportError, TransportExecError
 from rich.console import Console
 from rich.progress import Progress
 
-from upright import __version__, device, paths, runtimes
+from upright import __version__, device, packages, paths, runtimes
 
 RECORD = "upright.json"  # on the board: what was installed, {"version": , "files": {name: sha256}}
 JOURNAL, NEW = "update.json", ".new"  # as in firmware/update.py
+FILTERS = paths.FIRMWARE / "filters.py"
 # Sources on the board as well: the first two are run, not imported; the third is there to be edited.
 SOURCES = ("boot.py", "main.py", "board.py")
 # A user's own, if it is not what was installed: kept, unless --force
@@ -59,21 +60,54 @@ class Plan:
     record: dict
 
 
-def board_files(board: str, facts: device.Facts, source: bool = False) -> dict[str, bytes]:
-    """Every file of an installation: {name on the board: content}. Raises device.DeviceError."""
+def board_files(
+    board: str, facts: device.Facts, source: bool = False, own: str | None = None
+) -> dict[str, bytes]:
+    """Every file of an installation: {name on the board: content}. Raises device.DeviceError.
+
+    own: the text of another board.py, which may stay on the board; what it needs is installed as well.
+    """
     folder = paths.BOARDS / board
     if not (folder / "board.py").exists():
         known = ", ".join(sorted(p.parent.name for p in paths.BOARDS.glob("*/board.py")))
         raise device.DeviceError(f"unknown board {board!r}; there are {known}")
     compiler = None if source else _compiler(facts)
     files = {"board.py": (folder / "board.py").read_bytes()}
+    needed = library(files["board.py"].decode()) | (library(own) if own else set())
     for prefix, room in (("lib/", paths.LIB), ("", paths.FIRMWARE)):
         for path in sorted(room.glob("*.py")):
+            if room == paths.LIB and path.stem not in needed:
+                continue
             if compiler and path.name not in SOURCES:
                 files[f"{prefix}{path.stem}.mpy"] = _compile(compiler, facts.architecture, path)
             else:
                 files[prefix + path.name] = path.read_bytes()
     return files
+
+
+def library(text: str) -> set[str]:
+    """The modules of lib/ that the firmware needs with a board.py of this text: many boards have no room for all.
+
+    Of the filters the one that it names; without one, the firmware's default; where its name is worked out, all.
+    """
+    module = {name: module for name, (module, _) in setting(FILTERS.read_text(), "FILTERS").items()}
+    try:
+        chosen = setting(text, "FILTER")
+        wanted = {module[chosen]} if chosen in module else {module["inertial9"]}
+    except ValueError:
+        wanted = set(module.values())
+    imported = packages.imports(ast.parse(text))
+    for path in paths.FIRMWARE.glob("*.py"):
+        imported |= packages.imports(ast.parse(path.read_text()))
+    return {m for name in wanted | imported for m in packages.modules(name)}
+
+
+def setting(text: str, name: str):
+    """What a file of Python sets a name to, None when it does not. Raises ValueError when that is no constant."""
+    for node in ast.parse(text).body:
+        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == name:
+            return ast.literal_eval(node.value)
+    return None
 
 
 def _compiler(facts: device.Facts) -> Path:
@@ -216,7 +250,7 @@ def run(transport, board: str, source: bool, force: bool, console) -> bool:
         raise device.DeviceError(
             f"boards/{board} is for MicroPython's port {platform!r}; this board runs {found.platform!r}"
         )
-    steps = plan(transport, board_files(board, found, source), force)
+    steps = plan(transport, board_files(board, found, source, _own(transport)), force)
     for name in steps.kept:
         console.print(
             f"{name} on the board is your own: kept (--force replaces it)", highlight=False
@@ -242,17 +276,19 @@ def run(transport, board: str, source: bool, force: bool, console) -> bool:
     return True
 
 
+def _own(transport) -> str | None:
+    """The text of the board.py that is on the board."""
+    try:
+        text = transport.fs_readfile("board.py").decode()
+        ast.parse(text)
+    except (OSError, ValueError, SyntaxError):
+        return None
+    return text
+
+
 def board_platform(board: str) -> str | None:
     """The MicroPython port that a board's board.py is for (its PLATFORM), None when it says nothing."""
-    return board_platform_of((paths.BOARDS / board / "board.py").read_text())
-
-
-def board_platform_of(text: str) -> str | None:
-    """The same of a board.py's text."""
-    for node in ast.parse(text).body:
-        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "PLATFORM":
-            return ast.literal_eval(node.value)
-    return None
+    return setting((paths.BOARDS / board / "board.py").read_text(), "PLATFORM")
 
 
 def register(app: typer.Typer):
