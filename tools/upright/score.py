@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from upright import baselines, replay, runtimes, scoring, simulate, trials
+from upright import baselines, paths, plotting, replay, runtimes, scoring, simulate, trials
 
 FILTERS = "mahony6,mahony9,inertial6,inertial9,inertial9-lite"
 COLUMNS = (
@@ -33,9 +33,9 @@ COLUMNS = (
 STATISTICS = {"mean": np.mean, "median": np.median, "worst": np.max}
 FIGURES = ("inclination", "heading", "total")
 AS_GIVEN, BEST = "as given", "best heading"
+_NO_SCORE = scoring.Score(*[math.nan] * 7, samples=0, coverage=0.0)
 # What headers say when true north is not known, or not well enough
 _NO_NORTH = ("best heading", "best-heading", "heading arbitrary")
-PLOT_INSTALL = ".venv/bin/pip install -c tools/constraints.txt -e '.[plot]'"
 
 
 class ScoreError(ValueError):
@@ -44,12 +44,16 @@ class ScoreError(ValueError):
 
 @dataclass(frozen=True)
 class Row:
-    """What one filter made of one trial. measure: AS_GIVEN or BEST, by which heading and total count."""
+    """What one filter made of one trial. measure: AS_GIVEN or BEST, by which heading and total count.
+
+    q: its attitudes, float64 (n, 4), where they were to be kept.
+    """
 
     trial: str
     filter: str
     measure: str
     score: scoring.Score
+    q: np.ndarray | None = field(default=None, repr=False, compare=False)
 
     @property
     def inclination(self) -> float:
@@ -128,8 +132,10 @@ def find(paths: list[Path]) -> list[Path]:
     return list(dict.fromkeys(found))
 
 
-def load(files: list[Path], seconds: float | None, notes: list) -> list[tuple[Path, trials.Trial]]:
-    """The trials that can be scored; what cannot goes into notes."""
+def load(
+    files: list[Path], seconds: float | None, notes: list, truthless: bool = False
+) -> list[tuple[Path, trials.Trial]]:
+    """The trials that can be scored, or with `truthless` replayed; what cannot goes into notes."""
     usable, names = [], set()
     for file in files:
         try:
@@ -137,10 +143,10 @@ def load(files: list[Path], seconds: float | None, notes: list) -> list[tuple[Pa
         except (trials.TrialError, OSError) as why:
             notes.append(f"left out: {why}")
             continue
-        if not trial.has_truth:
+        if not trial.has_truth and not truthless:
             notes.append(f"left out: {file}: no truth in it")
             continue
-        if seconds is not None:
+        if seconds is not None and not truthless:
             known = trial.movement & np.isfinite(trial.q_gt[:, 0])
             if not (known & (trial.t_gt < seconds)).any():
                 notes.append(
@@ -169,19 +175,46 @@ def run(
     Raises ScoreError when nothing at all can be scored, and runtimes.Unavailable.
     """
     report = Report()
+    names = wanted(filters, with_baselines, report.notes)
+    runtimes.interpreter(runtime)
+    usable = load(files, seconds, report.notes)
+    if not usable:
+        raise ScoreError("\n".join([*report.notes, "no trial to score"]))
+    replay_all(report, usable, names, runtime, seconds, direct, jobs, on_progress)
+    if not report.rows:
+        raise ScoreError("\n".join([*report.notes, "nothing could be scored"]))
+    return report
+
+
+def wanted(filters: list[str], with_baselines: bool, notes: list) -> list[str]:
+    """The names of filters and baselines, each once; what is not installed goes into notes. Raises ScoreError."""
     if not filters:
         raise ScoreError("no filter to score")
     known = [*filter_names(), *baselines.BASELINES]
     for name in filters:
         if name not in known:
             raise ScoreError(f"unknown filter {name!r}; there are {', '.join(known)}")
-    runtimes.interpreter(runtime)
-    usable = load(files, seconds, report.notes)
-    if not usable:
-        raise ScoreError("\n".join([*report.notes, "no trial to score"]))
-    wanted = dict.fromkeys([*filters, *(baselines.BASELINES if with_baselines else ())])
-    wanted = _obtainable(wanted, report.notes)
-    work = [(file, trial, name) for file, trial in usable for name in wanted]
+    return _obtainable(
+        dict.fromkeys([*filters, *(baselines.BASELINES if with_baselines else ())]), notes
+    )
+
+
+def replay_all(
+    report: Report,
+    usable: list[tuple[Path, trials.Trial]],
+    names: list[str],
+    runtime: str,
+    seconds: float | None = None,
+    direct: bool = True,
+    jobs: int | None = None,
+    on_progress=None,
+    keep: bool = False,
+) -> None:
+    """Every one of the names on every trial: what it came to goes into the report.
+
+    keep: the rows keep the attitudes, and there are rows without a truth too, whose angles are NaN.
+    """
+    work = [(file, trial, name) for file, trial in usable for name in names]
     progress = _Progress(sum(trial.rows(seconds) for _, trial, _ in work), on_progress)
 
     def one(task):
@@ -189,18 +222,20 @@ def run(
         count = progress.of(trial.rows(seconds))
         try:
             if name in baselines.BASELINES:
-                score = scoring.score_trial(_baseline(name, file, trial, seconds), trial)
+                q = _baseline(name, file, trial, seconds)
             else:
-                score = replay.replay(
+                done = replay.replay(
                     trial, name, runtime, seconds, None, direct, lambda at, of: count(at)
-                ).score
+                )
+                q = done.q29 / scoring.ONE
+            score = scoring.score_trial(q, trial) if trial.has_truth else _NO_SCORE
         except (simulate.SimulationError, ValueError, OSError) as why:
             return f"left out: {name} on {trial.name}: {_last_line(why)}"
         finally:
             count(trial.rows(seconds))
-        if not score.samples or not math.isfinite(score.total):
+        if not keep and (not score.samples or not math.isfinite(score.total)):
             return f"left out: {name} on {trial.name}: no sample of it meets the truth"
-        return Row(trial.name, name, measure_of(trial, name), score)
+        return Row(trial.name, name, measure_of(trial, name), score, q if keep else None)
 
     # a thread only waits for its process
     with ThreadPoolExecutor(jobs or os.cpu_count() or 1) as pool:
@@ -210,19 +245,13 @@ def run(
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    if not report.rows:
-        raise ScoreError("\n".join([*report.notes, "nothing could be scored"]))
-    return report
 
 
-def filter_names() -> list[str]:
-    """The filters that the firmware knows."""
-    from upright import paths
-
-    folder = str(paths.ROOT / "firmware")
+def filter_names(of: str = "FILTERS") -> list[str]:
+    """The filters that the firmware knows; of="HARDWARE": those that a sensor computes by itself."""
     done = subprocess.run(
-        [sys.executable, "-c", "import filters; print(*filters.FILTERS)"],
-        cwd=folder,
+        [sys.executable, "-c", f"import filters; print(*filters.{of})"],
+        cwd=paths.FIRMWARE,
         capture_output=True,
         text=True,
     )
@@ -374,17 +403,19 @@ def save_png(report: Report, path: Path) -> None:
     Raises ScoreError where matplotlib is not installed, or the file cannot be written.
     """
     try:
-        from matplotlib import colormaps
-        from matplotlib.figure import Figure
-    except ImportError as why:
-        raise ScoreError(f"no picture: matplotlib is not installed: {PLOT_INSTALL}") from why
+        _draw(report, path)
+    except plotting.PictureError as why:
+        raise ScoreError(str(why)) from why
+
+
+def _draw(report, path):
     names, filters = report.names("trial"), report.names("filter")
     groups = [*names, f"mean_of all {len(names)}"] if len(names) > 1 else names
     by = {(row.trial, row.filter): row for row in report.rows}
-    figure = Figure(figsize=(max(7.0, 1.0 + 1.35 * len(groups)), 7.2), dpi=110)
+    figure = plotting.figure(max(7.0, 1.0 + 1.35 * len(groups)), 7.2)
     panels = figure.subplots(2, 1, sharex=True)
     width = 0.84 / len(filters)
-    colours = colormaps["tab20" if len(filters) > 10 else "tab10"].colors
+    colours = plotting.colours(len(filters))
     for panel, what in zip(panels, ("inclination", "total"), strict=True):
         shown = []
         for i, name in enumerate(filters):
@@ -392,8 +423,7 @@ def save_png(report: Report, path: Path) -> None:
             if len(groups) > len(names):
                 values.append(report.statistic("mean", name, what))
             at = np.arange(len(groups)) + (i - (len(filters) - 1) / 2) * width
-            colour = colours[i % len(colours)]
-            panel.bar(at, values, width, label=name, color=colour)
+            panel.bar(at, values, width, label=name, color=colours[i])
             shown += [value for value in values if math.isfinite(value)]
         # One that is lost is not to flatten all others: its bar leaves the picture, with its figure at the top. One too
         # small to be seen gets its figure as well, or it would look left out.
@@ -412,10 +442,7 @@ def save_png(report: Report, path: Path) -> None:
                 )
         panel.set_ylim(0, top)
         panel.set_ylabel(f"{what}, RMSE in deg")
-        panel.grid(axis="y", alpha=0.3)
-        panel.set_axisbelow(True)
-        for side in ("top", "right"):
-            panel.spines[side].set_visible(False)
+        plotting.tidy(panel, "y")
         if len(groups) > len(names):
             panel.axvline(len(names) - 0.5, color="0.6", linewidth=0.8)
     panels[1].set_xticks(np.arange(len(groups)), [_short(name) for name in groups], fontsize=8)
@@ -429,10 +456,7 @@ def save_png(report: Report, path: Path) -> None:
     )
     lines = -(-len(filters) // 6)
     figure.tight_layout(rect=(0, 0, 1, 0.97 - 0.028 * lines), h_pad=2.2)
-    try:
-        figure.savefig(path)
-    except (OSError, ValueError) as why:
-        raise ScoreError(f"no picture: {why}") from why
+    plotting.save(figure, path)
 
 
 def _short(name: str) -> str:
