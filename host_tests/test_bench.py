@@ -7,7 +7,7 @@ import pytest
 from conftest import PORTABLE, require
 from fixmath import euler
 from mahony import Mahony6, Mahony9
-from upright import bench
+from upright import bench, tracing
 
 
 def log(*lines):
@@ -24,7 +24,7 @@ LOG = log(
 @pytest.mark.parametrize("size", [1, 7, 64, 10**6])
 def test_instructions_are_counted_between_marks_however_the_log_is_cut(size):
     blocks = [LOG[i : i + size] for i in range(0, len(LOG), size)]
-    marks = list(bench.count_traces(blocks))
+    marks = list(tracing.count_traces(blocks))
     assert marks == [("begin a 0", 2), ("end a 0", 3), ("begin a 2", 3), ("end a 2", 10)]
 
 
@@ -35,7 +35,7 @@ def test_what_is_not_a_steps_is_taken_off():
         ("begin a 4", 20),
         ("end a 4", 70),
     ]
-    assert bench.per_step(marks) == {"a": (50 - 10) / 4}
+    assert tracing.per_step(marks) == {"a": (50 - 10) / 4}
 
 
 def test_loop_and_bus_are_subtracted():
@@ -117,7 +117,7 @@ def test_only_the_float_filter_allocates(micropython_runtime):
 
 
 def test_a_run_that_fails_says_so():
-    with pytest.raises(bench.BenchError, match="no_such_mode on cpython failed"):
+    with pytest.raises(tracing.TraceError, match="no_such_mode on cpython failed"):
         bench.say("cpython", "no_such_mode", 1)
 
 

@@ -21,6 +21,7 @@ from upright import (
     score,
     scoring,
     simulate,
+    tracing,
     trials,
 )
 
@@ -260,7 +261,7 @@ def test_a_filter_that_never_finds_up_has_no_settling_time(registry):
     registry(frozen="Frozen", broken="Broken")
     arguments = ((200, 1), (82, 5), 4096, simulate.best_runtime())
     assert filter_costs.settling("frozen", *arguments) is None
-    with pytest.raises(filter_costs.CostError, match="it breaks"):
+    with pytest.raises(tracing.TraceError, match="it breaks"):
         filter_costs.settling("broken", *arguments)
 
 
@@ -297,7 +298,7 @@ def test_instructions_are_an_updates_own(memory, registry):
 def test_costs_are_measured_once_until_a_source_changes(memory, registry, monkeypatch):
     require("unix")
     measured = []
-    monkeypatch.setattr(filter_costs, "_compile_for", lambda *of: None)
+    monkeypatch.setattr(tracing, "compile_for", lambda *of: None)
     monkeypatch.setattr(filter_costs, "_instructions", lambda name, _: measured.append(name) or 7.0)
     monkeypatch.setattr(filter_costs, "bytes_of", lambda *of: 0.0)
     monkeypatch.setattr(runtimes, "interpreter", lambda name: ([name], "1.25"))

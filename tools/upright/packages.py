@@ -16,10 +16,11 @@ import typer
 from upright import __version__, paths, runtimes
 
 # What a user asks for by name: the module that is imported, and what belongs beside it without being imported by it.
-_TOGETHER = {"mpu6500": ("ist8310",), "ist8310": ("mpu6500",)}
+_TOGETHER = {"mpu6500": ("ist8310",), "ist8310": ("mpu6500",), "mpu_dmp": ("mpu6050",)}
 # What serves other modules only
 _INNER = (
     *("fixmath", "mpu_common", "mpu_parts", "mpu_setup", "mpu_selftest", "inertial_kernels"),
+    *("euler_kernels", "quaternion_kernels", "mpu_dmp_image", "mpu_dmp_setup"),
     *("ssd1306_canvas", "ssd1306_font"),
 )
 INDEX_FORMAT = 1
@@ -38,14 +39,14 @@ def modules(name: str) -> list[str]:
         module = wanted.pop()
         if module not in found:
             found.add(module)
-            wanted += _imports(paths.LIB / f"{module}.py")
+            wanted += imports(ast.parse((paths.LIB / f"{module}.py").read_text()))
     return sorted(found)
 
 
-def _imports(path: Path) -> set[str]:
-    """The neighbours that a module imports, at its top or inside a function."""
+def imports(tree: ast.AST) -> set[str]:
+    """The modules of lib/ that a file imports, at its top or inside a function."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
