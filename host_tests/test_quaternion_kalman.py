@@ -1,0 +1,762 @@
+"""The quaternion Kalman filter: as its float twin, the same bits everywhere, and variances that mean something."""
+
+import math
+import random
+import re
+from array import array
+from functools import cache
+from pathlib import Path
+
+import fixmath
+import motions
+import numpy as np
+import overflow
+import pytest
+import quaternion_kernels as kernels
+from quaternion_kalman import QuaternionKalman, QuaternionKalman6, QuaternionKalman9
+from reference import quaternion_kalman_float
+from reference.inertial_float import start
+from test_inertial import all_axes, angles_between, as_start, errors, pushes, quickest, scene
+from upright import runtimes, scoring, trials
+
+LIB = runtimes.paths.LIB
+ONE = 1 << 29
+SCALE = (82, 5)  # LSB per deg/s at +-2000 deg/s
+SCALES = {250: (131, 1), 500: (131, 2), 1000: (164, 5), 2000: (82, 5)}
+APART_DEG = 0.1
+PACES = [(90, 1), (200, 3), (500, 10)]
+UPPER = [(i, j) for i in range(8) for j in range(i, 8)]
+
+
+class History:
+    """What portable/quaternion_kalman_history.py wrote: q (n, 4), bias_dps (n, 3), decided (n,), words.
+
+    With cov=1 a row is a block, and there are P (n, 8, 8) in rad, rad/s and g s, and sigma (n, 8).
+    """
+
+    def __init__(self, file, rendered, cov):
+        self.words = np.fromfile(file, "<i4").reshape(-1, 46 if cov else 8)
+        self.q = self.words[:, :4] / ONE
+        self.decided = self.words[:, -1]
+        filter = QuaternionKalman9(rendered.rate, rendered.gyro_scale, rendered.accel_lsb_per_g)
+        c = filter.state[kernels._C] + 15
+        self.T = (1 << filter.state[kernels._BLOCK]) * rendered.rate[1] / rendered.rate[0]
+        bias = self.words[:, 40:43] if cov else self.words[:, 4:7]
+        self.bias_dps = np.degrees(bias / 2.0 ** (c + 10) / self.T)
+        if cov:
+            unit = np.array([2.0**-15] * 3 + [2.0**-c / self.T] * 3 + [2.0**-10 * self.T] * 2)
+            self.P = np.empty((len(self.words), 8, 8))
+            for k, (i, j) in enumerate(UPPER):
+                self.P[:, i, j] = self.P[:, j, i] = self.words[:, 4 + k] * unit[i] * unit[j]
+            self.sigma = np.sqrt(np.einsum("nii->ni", self.P))
+
+
+@pytest.fixture
+def history(portable, tmp_path):
+    """history(rendered, axes, mag_every, *more, runtime=...) -> History of all its rows."""
+
+    def run(rendered, axes=9, mag_every=1, *more, runtime=None):
+        world, out = tmp_path / "world.imu", tmp_path / "out"
+        rendered.write(world)
+        arguments = (world, out, axes, mag_every, *more)
+        portable(runtime or quickest(), "quaternion_kalman_history.py", *arguments)
+        return History(out, rendered, "cov=1" in more)
+
+    return run
+
+
+def twin_history(rendered, decided, axes=9, mag_every=1, first=None):
+    """The float twin with the decisions of the integer run: (attitudes (n, 4), the twin)."""
+    rows = rendered.counts.astype(int)
+    plain = rows[:, 10] == 0
+    rows[plain, 10] = np.where(np.arange(len(rows))[plain] % mag_every == 0, 3, 1)
+    rows = rows.tolist()
+    num, den = rendered.rate
+    scale = rendered.gyro_scale[0] / rendered.gyro_scale[1]
+    twin = quaternion_kalman_float.QuaternionKalmanFloat(
+        num / den, scale, rendered.accel_lsb_per_g, axes
+    )
+    if first is None:
+        twin.set_quaternion(start(rows[0], axes), True)
+    else:
+        twin.set_quaternion(first)
+    q = np.empty((len(rows), 4))
+    for i, (row, bits) in enumerate(zip(rows, decided, strict=True)):
+        twin.update(row, bits)
+        q[i] = twin.q
+    return q, twin
+
+
+# -- accuracy against the float twin; pytest -rP shows the figures
+@pytest.mark.parametrize("name", motions.MOTIONS)
+@pytest.mark.parametrize("rate, seconds, mag_every", [(100, 12, 1), (200, 10, 3), (1000, 3, 10)])
+def test_never_a_tenth_of_a_degree_from_the_float_twin(history, name, rate, seconds, mag_every):
+    rendered = motions.render(name, rate=(rate, 1), seconds=seconds, accel_range_g=16)
+    for axes in (9, 6):
+        got = history(rendered, axes, mag_every)
+        q, twin = twin_history(rendered, got.decided.tolist(), axes, mag_every)
+        worst = angles_between(got.q, q).max()
+        print(f"{name} {rate} Hz {axes} axes: {worst:.5f} deg")
+        assert worst < APART_DEG
+        assert twin.disagreed <= 3
+
+
+def test_a_wrong_start_as_the_float_twin(history):
+    for axis, degrees in (((1, 2, 0), 160), ((-0.5, 0.5, 0.7), 90)):
+        rendered = scene(200, 6)
+        got = history(rendered, 9, 1, as_start(axis, degrees))
+        first = motions.exponential(math.radians(degrees) * np.array(axis) / np.linalg.norm(axis))
+        q, twin = twin_history(rendered, got.decided.tolist(), first=first.tolist())
+        assert angles_between(got.q, q).max() < APART_DEG
+        assert twin.disagreed <= 3
+
+
+# inclination and total; aligned where north is uncertain
+FIGURES = {
+    "mpu6050_static": {"inclination": 0.1, "aligned_heading": 0.3},
+    "tyrex_nexus5_Thibaud_NoDist": {"inclination": 1.5, "aligned_total": 2.4},
+    "broad_": {"inclination": 1.3, "total": 3.2},
+}
+
+
+def test_recorded_trials_as_the_float_twin(history, recorded):
+    trial = trials.load(recorded)
+    trial.counts = trial.counts[: 4000 if quickest() == "cpython" else 16000]
+    got = history(trial)
+    q, twin = twin_history(trial, got.decided.tolist())
+    worst = angles_between(got.q, q).max()
+    print(f"{trial.name}: {worst:.4f} deg apart, {twin.disagreed} decisions otherwise")
+    assert worst < APART_DEG
+    assert twin.disagreed <= 5
+
+
+def test_recorded_trials_as_accurate_as_promised(history):
+    files = trials.trial_files()
+    if not files or quickest() == "cpython":
+        pytest.skip("needs recorded trials and the unix runtime")
+    nine, six = [], []
+    for file in files:
+        trial = trials.load(file)
+        score = scoring.score_trial(history(trial).q, trial)
+        print(f"{trial.name}\n{score}")
+        for name, limits in FIGURES.items():
+            if trial.name.startswith(name):
+                for figure, limit in limits.items():
+                    assert getattr(score, figure) < limit, (trial.name, figure)
+        if trial.name.startswith("broad_"):
+            nine.append((score.inclination, score.total))
+            six.append(scoring.score_trial(history(trial, 6).q, trial).aligned_total)
+    if len(nine) >= 6:
+        (inclination, total), relative = np.mean(nine, 0), np.mean(six)
+        print(f"inclination {inclination:.3f}, total {total:.3f}; six axes: total {relative:.3f}")
+        assert inclination <= 0.78
+        assert total <= 1.85
+        assert relative <= 2.03
+
+
+# -- the covariance
+def motion_of_vibration(rate, seconds):
+    """Level and north, never at rest: the vertical acceleration differs from block to block; no noise at all."""
+    n = rate * seconds
+    counts = np.zeros((n, 11), np.int16)
+    counts[:, 2] = np.where(np.arange(n) // 4 % 2, 2048 + 400, 2048 - 400)
+    counts[:, 6], counts[:, 8], counts[:, 10] = 1000, -2000, 3
+    q = np.tile([1.0, 0, 0, 0], (n, 1))
+    return motions.Motion("vibration", counts, q, np.zeros((n, 3)), (rate, 1), 2048, SCALE)
+
+
+def test_the_covariance_settles_where_the_riccati_equation_says(history):
+    """A body that does not turn is a constant system: against scipy's discrete algebraic Riccati equation."""
+    linalg = pytest.importorskip("scipy.linalg")
+    rate, walk, gyro, mag, velocity = 100, 0.1, 0.3, 0.05, 0.5
+    got = history(
+        motion_of_vibration(rate, 150),
+        9,
+        1,
+        "cov=1",
+        f"bias_walk={walk}",
+        f"gyro_noise={gyro}",
+        f"mag_noise={mag}",
+        f"velocity_noise={velocity}",
+    )
+    assert not (got.decided[10:] & quaternion_kalman_float.STILL).any()
+    T = got.T
+    first, second = np.eye(8), np.eye(8)
+    first[0:3, 3:6] = -T * np.eye(3)
+    second[6, 1], second[7, 0] = T, -T
+    F = second @ first
+    Q = np.diag([math.radians(gyro) ** 2 * T] * 3 + [math.radians(walk) ** 2 * T] * 3 + [0, 0])
+    H = np.zeros((3, 8))
+    H[0, 6] = H[1, 7] = H[2, 2] = 1
+    R = np.diag([(velocity / 9.80665) ** 2 / T] * 2 + [mag**2 / T])
+    prior = linalg.solve_discrete_are(F.T, H.T, Q, R)
+    K = prior @ H.T @ np.linalg.inv(H @ prior @ H.T + R)
+    posterior = (np.eye(8) - K @ H) @ prior
+    sigma = np.sqrt(np.diag(posterior))
+    scale = np.outer(sigma, sigma)
+    apart = np.abs(got.P[-1] - posterior) / scale
+    print(f"P against the Riccati equation: {apart.max():.5f} of sigma_i sigma_j")
+    assert apart.max() < 0.01
+    assert (
+        np.abs(got.P[len(got.P) // 60] - posterior).max() > 0.1 * scale.max()
+    )  # it came from elsewhere
+
+
+def healthy(P):
+    """The least eigenvalue of the correlation matrices, which is above 0 for a covariance."""
+    sigma = np.sqrt(np.einsum("nii->ni", P))
+    correlation = P / sigma[:, :, None] / sigma[:, None, :]
+    off = np.abs(correlation - np.eye(8)).max()
+    return np.linalg.eigvalsh(correlation).min(), off
+
+
+def tilt_errors(got, rendered):
+    """The error's part about the two horizontal axes of the earth at each block's end, in sigmas: (n, 2)."""
+    n = len(rendered.q_true)
+    at = np.flatnonzero(np.arange(n) % round(got.T * rendered.rate[0]) == 0)
+    # a block's work ends with the first block's last sample but one: its rows are those with phase 0 next
+    at = (
+        np.arange(len(got.q)) * round(got.T * rendered.rate[0])
+        + round(got.T * rendered.rate[0])
+        - 2
+    )
+    e = motions.multiply(rendered.q_true[at], got.q * [1, -1, -1, -1])
+    angle = 2 * e[:, 1:3] * np.sign(e[:, :1])
+    return angle / got.sigma[:, 0:2]
+
+
+@pytest.mark.parametrize("name", ["slow", "coning", "hand", "demo"])
+def test_the_covariance_is_one_and_the_errors_are_within_it(history, name):
+    rendered = motions.render(name, rate=(200, 1), seconds=60, accel_range_g=16)
+    got = history(rendered, 9, 1, "cov=1")
+    least, off = healthy(got.P)
+    assert least > 0.002 and off < 0.999
+    normalised = np.abs(tilt_errors(got, rendered))
+    print(f"{name}: worst {normalised.max():.2f} sigma, least eigenvalue {least:.3f}")
+    assert (normalised < 3).mean() > 0.97
+    bias = np.abs(got.bias_dps - (1.2, -0.8, 0.6)) / np.degrees(got.sigma[:, 3:6])
+    assert (bias[len(bias) // 4 :] < 4).mean() > 0.9
+
+
+def test_the_covariance_of_recorded_motion_is_one(history, recorded):
+    trial = trials.load(recorded)
+    trial.counts = trial.counts[: 4000 if quickest() == "cpython" else 16000]
+    least, off = healthy(history(trial, 9, 1, "cov=1").P)
+    assert least > 0.002 and off < 0.999
+
+
+@pytest.mark.parametrize("rate, lsb", [(100, 2048), (200, 16384), (1000, 64)])
+def test_the_covariance_outlives_any_samples(history, rate, lsb):
+    """Full scale at random, held for a while or not, some not fresh."""
+    n = 20000
+    rng = np.random.default_rng(3)
+    counts = np.zeros((n, 11), np.int16)
+    held = rng.integers(-32768, 32768, (n // 500, 9)).repeat(500, 0)
+    counts[:, :9] = np.where(rng.random((n, 1)) < 0.5, held, rng.integers(-32768, 32768, (n, 9)))
+    counts[:, 10] = np.where(rng.random(n) < 0.9, 3, 2)
+    rendered = motions.Motion("any", counts, None, None, (rate, 1), lsb, SCALE)
+    got = history(rendered, 9, 1, "cov=1")
+    least, off = healthy(got.P)
+    assert least > 0.002 and off < 0.999
+    assert np.abs(np.linalg.norm(got.q, axis=1) - 1).max() < 2e-8
+
+
+def test_sigmas_of_motion_and_rest():
+    filter = QuaternionKalman9(200, SCALE, 4096)
+    row = counts(flags=3)
+    assert filter.tilt_uncertainty_mdeg == pytest.approx(math.degrees(0.75) * 1000, rel=1e-3)
+    filter.seed(row)
+    assert filter.tilt_uncertainty_mdeg == pytest.approx(3000, abs=5)
+    assert filter.heading_uncertainty_mdeg == pytest.approx(5000, abs=5)
+    run(filter, row, 200 * 20)
+    rested = filter.tilt_uncertainty_mdeg, filter.heading_uncertainty_mdeg
+    assert rested[0] < 500 and rested[1] < 3000
+    run(filter, counts(gz=8000, flags=1), 200 * 3)  # turning fast, without a magnetometer
+    assert filter.tilt_uncertainty_mdeg > 2 * rested[0]
+    assert filter.heading_uncertainty_mdeg > rested[1]
+
+
+# -- start and recovery
+@pytest.mark.parametrize("rate, mag_every", [(90, 1), (200, 3), (1000, 10)])
+@pytest.mark.parametrize("degrees", [90, 150, 170])
+def test_a_wrong_start_is_level_within_half_a_second(history, rate, mag_every, degrees):
+    rendered = scene(rate, 3, bias_dps=(0, 0, 0), mag_every=mag_every)
+    for axis in ((1, 0, 0), (-0.5, 0.5, 0.7)):
+        got = history(rendered, 9, 1, as_start(axis, degrees))
+        inclination, heading = errors(got.q, rendered)
+        assert inclination[int(0.5 * rate) :].max() < 2, axis
+        assert abs(heading[-1]) < 8, axis
+        assert inclination[0] > 20  # it was wrong
+
+
+@pytest.mark.parametrize("rate, mag_every", PACES)
+def test_a_bias_at_rest_is_found_within_three_seconds(history, rate, mag_every):
+    bias = (5, -5, 5)
+    got = history(scene(rate, 3, bias_dps=bias, mag_every=mag_every))
+    assert np.abs(got.bias_dps[-1] - bias).max() < 0.1
+    assert np.abs(got.bias_dps[rate] - bias).max() > 1  # and after one it was not known
+
+
+@pytest.mark.parametrize("rate, mag_every", PACES)
+@pytest.mark.parametrize("axes", [9, 6])
+def test_a_bias_is_found_while_everything_turns_from_the_first_second(
+    history, rate, mag_every, axes
+):
+    bias = (4, -4, 4)
+    got = history(scene(rate, 60, all_axes, pushes, bias, mag_every=mag_every), axes)
+    assert np.abs(got.bias_dps[-1] - bias).max() < 0.2
+    assert not (got.decided[5 * rate :] & quaternion_kalman_float.STILL).all()
+
+
+@pytest.mark.parametrize("rate, mag_every", PACES)
+@pytest.mark.parametrize("kick", [(90, 0, 0), (0, 0, 90), (0, 0, -40), (52, 52, 52)], ids=str)
+def test_a_kick_at_rest_is_forgotten(history, rate, mag_every, kick):
+    rendered = scene(rate, 37, kick=(25, kick), mag_every=mag_every)
+    got = history(rendered)
+    inclination, heading = errors(got.q, rendered)
+    at = 25 * rate
+    assert max(inclination[at + 1], abs(heading[at + 1])) > 35  # it was one
+    assert inclination[at + 4 * rate :].max() < 3
+    assert np.abs(heading[at + 10 * rate :]).max() < 5
+    assert np.abs(got.bias_dps[-1] - (1.2, -0.8, 0.6)).max() < 0.1
+
+
+def test_a_kick_in_motion_is_forgotten(history):
+    rendered = scene(200, 40, all_axes, pushes, kick=(25, (60, -40, 0)))
+    inclination, _ = errors(history(rendered).q, rendered)
+    assert inclination[25 * 200 + 1] > 35
+    assert inclination[39 * 200 :].max() < 5  # it takes seconds: the velocity has to run away first
+
+
+@pytest.mark.parametrize("rate, mag_every", [(90, 1), (200, 3)])
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_magnet_comes_and_goes_and_never_tilts(history, rate, mag_every, moving):
+    motion = all_axes if moving else None
+    plain = history(scene(rate, 60, motion, mag_every=mag_every)).q
+    for extra in ((10, 40, -20), (0, 200, 100)):
+
+        def field(t, extra=extra):
+            return np.outer((t > 20) & (t < 45), extra)
+
+        rendered = scene(rate, 60, motion, field=field, mag_every=mag_every)
+        q = history(rendered).q
+        inclination, heading = errors(q, rendered)
+        assert np.abs(heading[10 * rate :]).max() < (5 if moving else 1.5), extra
+        without, _ = errors(plain, rendered)
+        assert np.abs(inclination - without)[10 * rate :].max() < 0.3
+        if rate == 90 and extra[1] == 40 and not moving:  # were it not left out, it would show
+            _, heading = errors(history(rendered, 9, 1, "field_tolerance=0.7").q, rendered)
+            assert np.abs(heading[10 * rate :]).max() > 3
+
+
+def test_a_turntable_from_power_on_is_taken_for_a_bias(history):
+    """The known limit; after a rest it is not: a known bias does not jump."""
+    rendered = scene(200, 20, lambda t: np.outer(t >= 0, (0, 0, 3.0)), bias_dps=(0, 0, 0))
+    assert history(rendered, 6).bias_dps[-1, 2] == pytest.approx(3, abs=0.1)
+    rendered = scene(200, 60, lambda t: np.outer(t > 10, (0, 0, 3.0)), bias_dps=(0, 0, 0))
+    assert history(rendered, 6).bias_dps[-1, 2] == pytest.approx(0, abs=0.1)
+
+
+def test_swings_cancel_before_they_count_as_tilt(history):
+    """0.5 g to and fro at 1.5 Hz, no rotation: the classic filter would follow by degrees."""
+
+    def swing(t):
+        return np.outer(np.sin(2 * np.pi * 1.5 * t) * (t > 10), (0.5, 0, 0))
+
+    inclination, _ = errors(history(rendered := scene(200, 30, accel=swing)).q, rendered)
+    assert inclination[10 * 200 :].max() < 1.2
+
+
+def test_a_long_push_is_the_price(history):
+    """The known limit: 0.3 g for 5 s is a velocity of 15 m/s, which the model takes for a tilt."""
+
+    def push(t):
+        return np.outer((t > 15) & (t < 20), (0.3, 0, 0))
+
+    inclination, _ = errors(history(rendered := scene(200, 40, accel=push)).q, rendered)
+    assert 5 < inclination[15 * 200 :].max() < 18  # 0.3 g for good: 16.7 deg
+    assert inclination[-1] < 2
+
+
+# -- the same bits, no allocation
+@cache
+def pieces():
+    rates = ((200, 1), (2000, 7), (500, 1), (1000, 1), (90, 1), (1439, 1), (333, 1))
+    out = [
+        motions.render(name, rate=rate, seconds=400 * rate[1] / rate[0], seed=5)
+        for name, rate in zip(motions.MOTIONS, rates, strict=True)
+    ]
+    return [*out, scene(90, 10, kick=(6, (100, 30, 60)), mag_every=3)]
+
+
+_EXPECTED = {}
+
+
+def test_every_attitude_and_decision_has_the_same_bits_on_every_runtime(
+    history, micropython_runtime
+):
+    for i, rendered in enumerate(pieces()):
+        more = (as_start((1, 2, 0), 160),) if i % 2 else ("bias=300,-200,1",)
+        if i not in _EXPECTED:
+            _EXPECTED[i] = history(rendered, 9, 2, *more, runtime="cpython").words
+        got = history(rendered, 9, 2, *more, runtime=micropython_runtime).words
+        assert np.array_equal(got, _EXPECTED[i]), rendered.name
+        assert len(np.unique(got[:, :4], axis=0)) > 100
+
+
+def test_nothing_is_allocated_in_10000_updates_and_conversions(portable, micropython_runtime):
+    said = portable(micropython_runtime, "quaternion_kalman_alloc.py")
+    assert said.split("\n")[:2] == ["locked: nothing allocated", "bytes allocated: 0"]
+
+
+@pytest.mark.parametrize("waste", ["float", "list"])
+def test_an_allocation_in_the_tick_is_caught(portable, waste):
+    if quickest() == "cpython":
+        pytest.skip("needs a MicroPython")
+    said = portable("unix", "quaternion_kalman_alloc.py", waste).split("\n")[:2]
+    assert said[0] == "locked: MemoryError"
+    assert int(said[1].split(": ")[1]) >= 8000
+
+
+def constants(module):
+    text = Path(LIB, f"{module}.py").read_text()
+    return dict(re.findall(r"^(_?[A-Z]\w*) = const\((\d+)\)", text, re.M))
+
+
+def test_both_modules_mean_the_same_words():
+    ours, theirs = constants("quaternion_kalman"), constants("quaternion_kernels")
+    shared = ours.keys() & theirs.keys()
+    assert len(shared) > 60
+    assert {name: ours[name] for name in shared} == {name: theirs[name] for name in shared}
+    assert ours["_OPEN"] == theirs["OPEN"]
+    for name, word in constants("fixmath").items():
+        if "_" + name in ("_PROBE", "_Q", "_QR", "_W", "_WR"):
+            assert ours.get("_" + name, word) == theirs.get("_" + name, word) == word
+
+
+# -- no intermediate leaves 32 bits
+CORNERS = [
+    # rate, full scale, LSB per g, parameters
+    (90, 2000, 2048, {}),
+    (60, 2000, 2048, {"bias_start": 10, "rest_noise": 1, "gyro_noise": 1, "bias_walk": 0.1}),
+    (1000, 2000, 16384, {"bias_start": 10, "scale_error": 0.02, "velocity_noise": 2}),
+    (1439, 250, 32767, {"bias_start": 0.5, "velocity_noise": 0.1, "mag_noise": 0.01}),
+    (50, 250, 64, {"bias_start": 10, "accel_noise": 1, "mag_noise": 0.2, "gyro_noise": 1}),
+    (50, 1000, 16383, {"field_tolerance": 0.7, "scale_error": 0.02, "bias_walk": 0.1}),
+    ((2000, 7), 500, 8192, {"bias_start": 0.5, "rest_noise": 0.01, "accel_noise": 0.02}),
+    (1439, 500, 64, {"velocity_noise": 2, "mag_noise": 0.2, "rest_accel_g": 0.1}),
+    (50, 500, 8192, {"bias_start": 0.5, "bias_walk": 0.025, "rest_noise": 1, "gyro_noise": 1}),
+]
+UNUSED = ("fixmath._euler", "fixmath.tilt", "fixmath.north")
+
+
+@pytest.fixture(scope="module")
+def checked():
+    watch = overflow.Watch()
+    names = ("fixmath", "quaternion_kernels", "quaternion_kalman")
+    modules = overflow.loaded([LIB / f"{name}.py" for name in names], watch)
+    return watch, modules["quaternion_kalman"]
+
+
+def word(rng):
+    return rng.choice((-32768, 32767, 32766, rng.randint(-32768, 32767), rng.randint(-900, 900)))
+
+
+def covariance(rng, most):
+    """A covariance with sigmas up to `most`, from none to full correlation, as the 36 integers of a state."""
+    n = rng.choice((1, 2, 8, 8))
+    a = np.array([[rng.gauss(0, 1) for _ in range(n)] for _ in range(8)])
+    a /= np.linalg.norm(a, axis=1)[:, None]
+    sigma = [m * rng.choice((1, 1, rng.random(), rng.random() ** 4, 5 / m)) for m in most]
+    P = (a @ a.T) * np.outer(sigma, sigma)
+    return [max(16, int(P[i, j])) if i == j else int(P[i, j]) for i, j in UPPER]
+
+
+def disturb(rng, filter):
+    """Any state that the filter can come to, and the largest values foremost."""
+    s, k = filter.state, kernels
+    filter.set_bias(*(rng.choice((-(1 << 21), 1 << 21, 0)) for _ in range(3)))
+
+    def put(at, n, size):
+        for i in range(n):
+            s[at + i] = rng.choice((-size, size, 0, rng.randint(-size, size)))
+
+    q = np.array([rng.choice((-1, 0, 1, rng.gauss(0, 1))) for _ in range(4)])
+    if not q.any():
+        q[0] = 1
+    q = q / np.linalg.norm(q) * ONE
+    for i in range(4):
+        s[k._Q + i] = (int(q[i]) >> 15 << 15) + rng.choice((16383, 16384, -16383))
+    block = 1 << s[k._BLOCK]
+    put(k._HS, 3, 29000000 * (block - 1))
+    put(k._AS, 3, 32768 * (block - 1))
+    put(k._GS, 3, 32768 * (block - 1))
+    n = rng.randint(0, block - 1)
+    put(k._MS, 3, 29000000 * n)
+    s[k._MN] = n
+    # what a measurement leaves: within 5 sigma, twice
+    put(k._X, 3, rng.choice((20000000, 80000000)))
+    put(k._X + 3, 3, 130000000)
+    put(k._X + 6, 2, 130000000)
+    put(k._V, 2, k._V_MOST)
+    put(k._B, 3, s[k._B_MOST])
+    roots = [26214] * 3 + [math.isqrt(s[k._BS])] * 3 + [26214] * 2
+    for i, v in enumerate(covariance(rng, roots)):
+        s[k._P + i] = v
+    put(k._LOW1, 3, 32767 << 12)
+    put(k._LOW2, 3, 32767 << 12)
+    put(k._LOW1 + 3, 3, 40960 << 12)
+    put(k._LOW2 + 3, 3, 40960 << 12)
+    s[k._BLOCKS] = rng.choice((0, 1, s[k._BLOCKS]))
+    s[k._STILL] = rng.choice((0, s[k._REST_AFTER]))
+    s[k._WIDE_FOR] = rng.choice((0, 0, s[k._WIDE_MOST]))
+    s[k._LOST] = rng.choice((0, s[k._LOST_MOST]))
+    s[k._SINCE] = rng.choice((0, 1, 15, 16))
+    s[k._HAVE] = rng.choice((0, 1, 1))
+    for i in range(2):
+        s[k._FIELD + 2 * i] = rng.randint(0, 464000000)
+        s[k._FIELD + 2 * i + 1] = rng.choice((-464000000, 464000000, 1000))
+    if rng.random() < 0.5:
+        s[k._REF], s[k._REF + 1] = s[k._FIELD], s[k._FIELD + 1]
+    s[k._NEAR] = rng.choice((0, s[k._FIELD_AFTER]))
+    s[k._AGE] = rng.choice((0, 1, 16384))
+    s[k._FAR] = rng.choice((0, s[k._FAR_MOST]))
+    s[k._QTR], s[k._QBR] = rng.choice((0, 65535)), rng.choice((0, 4095))
+    for i in range(3):
+        s[fixmath.WR + i] = rng.choice((0, 32767))
+
+
+def stand_still(rng, filter, row):
+    """Let the rest detector be content, with the largest bias against the opposite estimate."""
+    s, k = filter.state, kernels
+    block = 1 << s[k._BLOCK]
+    filter.set_bias(*(rng.choice((-(1 << 21), 1 << 21, 0)) for _ in range(3)))
+    most = s[k._REST_MOST] // 4096
+    for i in range(3):
+        low = rng.choice((-most, most))
+        row[3 + i] = low + s[k._BASE + i] // 256
+        s[k._LOW1 + 3 + i] = s[k._LOW2 + 3 + i] = low << 12
+        s[k._GS + i] = row[3 + i] * (block - 1)
+        s[k._LOW1 + i] = s[k._LOW2 + i] = row[i] << 12
+        s[k._AS + i] = row[i] * (block - 1)
+    if rng.random() < 0.5:  # in free fall, so that nothing tells of a tilt
+        for i in range(3):
+            row[i] = s[k._HS + i] = s[k._AS + i] = s[k._LOW1 + i] = s[k._LOW2 + i] = 0
+    s[k._BLOCKS] = 1000
+    s[k._STILL] = rng.choice((s[k._REST_AFTER], 0))
+
+
+def test_nothing_leaves_32_bits_at_the_corners_of_the_accepted_range(checked):
+    watch, module = checked
+    rng = random.Random(4)
+    for rate, fsr, lsb, parameters in CORNERS:
+        filter = module.QuaternionKalman(rate, SCALES[fsr], lsb, 9, **parameters)
+        for _ in range(60):
+            disturb(rng, filter)
+            row = array(
+                "h", [word(rng) for _ in range(10)] + [rng.choice((3, 3, 3, 3, 7, 1, 0, 2))]
+            )
+            if rng.random() < 0.2:
+                row[6] = row[7] = row[8] = 0
+            if rng.random() < 0.4:
+                stand_still(rng, filter, row)
+            filter.state[48] = 0
+            for _ in range(9):
+                filter.update(row)
+                assert abs(math.hypot(*filter.state[1:5]) / ONE - 1) < 1e-3
+    assert [m for m in watch.missed() if not m.startswith(UNUSED)] == []
+
+
+# -- interface
+def counts(ax=0, ay=0, az=4096, gx=0, gy=0, gz=0, mx=66, my=0, mz=-150, flags=1):
+    return array("h", [ax, ay, az, gx, gy, gz, mx, my, mz, 0, flags])
+
+
+def run(filter, row, n):
+    for _ in range(n):
+        filter.update(row)
+
+
+def test_the_names_of_the_registry():
+    for kind, name, axes in (
+        (QuaternionKalman6, "quaternion-kalman6", 6),
+        (QuaternionKalman9, "quaternion-kalman9", 9),
+    ):
+        filter = kind(200, SCALE, 4096)
+        assert kind.NAME == filter.NAME == name
+        assert kind.AXES == filter.AXES == axes
+        out = array("i", [0] * 4)
+        filter.quaternion(out)
+        q = list(filter.state[filter.QUATERNION : filter.QUATERNION + 4])
+        assert list(out) == [ONE, 0, 0, 0] == q
+
+
+@pytest.mark.parametrize("yaw", [0, 40, -90, 179])
+def test_seed_takes_the_heading_of_the_magnetometer(yaw):
+    q = motions.quaternion_zyx(yaw, 20, -35)
+    turn = motions._matrix(q[None])[0]
+    accel, mag = 4096 * turn[2], np.array([66, 0, -150]) @ turn
+    row = counts(*(round(v) for v in accel), 0, 0, 0, *(round(v) for v in mag), flags=3)
+    filter = QuaternionKalman9(200, SCALE, 4096)
+    assert filter.seed(row) is True
+    assert angles_between(np.array([filter.quaternion_floats()]), q[None])[0] < 0.5
+    run(filter, row, 20)
+    assert angles_between(np.array([filter.quaternion_floats()]), q[None])[0] < 0.7
+    for kind, flags in ((QuaternionKalman6, 3), (QuaternionKalman9, 1)):
+        filter = kind(200, SCALE, 4096)
+        row[10] = flags
+        filter.seed(row)
+        out = array("i", [0] * 3)
+        filter.angles(out)
+        assert abs(out[2]) < 20 and abs(out[1] - 20000) < 100
+
+
+def test_seed_without_gravity_or_with_the_field_upright():
+    filter = QuaternionKalman9(200, SCALE, 4096)
+    assert filter.seed(counts(0, 0, 255)) is False
+    assert filter.quaternion_floats() == (1, 0, 0, 0)
+    assert filter.seed(counts(0, 0, 4096, 0, 0, 0, 0, 0, -150, flags=3)) is True
+    assert filter.quaternion_floats() == (1, 0, 0, 0)
+
+
+@pytest.mark.parametrize("b", [8192 * 256, -8192 * 256, 12345, -1, 0])
+def test_the_bias_reads_back(b):
+    filter = QuaternionKalman9(200, SCALE, 4096)
+    filter.set_bias(b, -b, 5)
+    out = array("i", [0] * 3)
+    filter.bias(out)
+    assert list(out) == [b, -b, 5]
+    filter.bias_mdps(out)
+    assert list(out)[:2] == [round(b * 1000 / 256 / 16.4), round(-b * 1000 / 256 / 16.4)]
+
+
+@pytest.mark.parametrize("b", [8192 * 256 + 1, 1.5])
+def test_a_bias_that_the_numbers_cannot_hold_is_refused(b):
+    with pytest.raises(ValueError, match=r"bias is .*, at most \+-2097152"):
+        QuaternionKalman9(200, SCALE, 4096).set_bias(0, b, 0)
+
+
+def test_a_bias_that_was_set_is_subtracted_and_what_is_learnt_comes_on_top():
+    filter = QuaternionKalman6(200, SCALE, 4096)
+    filter.set_bias(0, 0, 820 * 256)  # 50 deg/s
+    out = array("i", [0] * 3)
+    run(filter, counts(gz=820), 200)
+    filter.angles(out)
+    assert abs(out[2]) < 5
+    run(filter, counts(gz=820 + 33), 200 * 10)  # 2.01 deg/s more
+    filter.bias_mdps(out)
+    assert out[2] == pytest.approx(853000 / 16.4, abs=50)
+    saved = array("i", [0] * 3)
+    filter.bias(saved)
+    fresh = QuaternionKalman6(200, SCALE, 4096)
+    fresh.set_bias(*saved)
+    run(fresh, counts(gz=853), 200)
+    fresh.angles(out)
+    assert abs(out[2]) < 60
+
+
+def test_it_coasts_on_the_last_gyro_words_without_feedback():
+    filter = QuaternionKalman9(200, SCALE, 4096)
+    run(filter, counts(flags=3), 200 * 4)
+    before = list(filter.state)
+    run(filter, counts(4096, 0, 0, gz=820, mx=-66, flags=2), 200)  # they disagree
+    out = array("i", [0] * 3)
+    filter.angles(out)
+    assert out[2] == pytest.approx(50000, abs=30)
+    assert abs(out[0]) < 30 and abs(out[1]) < 30
+    # nothing but the attitude and its remainders has changed
+    assert list(filter.state)[15:] == before[15:]
+
+
+def test_what_it_says_of_itself():
+    filter = QuaternionKalman9(200, SCALE, 4096)
+    assert (filter.resting, filter.mag_accepted) == (False, False)
+    row = counts(flags=3)
+    filter.seed(row)
+    run(filter, row, 200)
+    assert not filter.resting
+    run(filter, row, 400)
+    assert filter.resting and filter.mag_accepted
+    run(filter, counts(mx=0, my=400, flags=3), 200)
+    assert not filter.mag_accepted
+    rng = random.Random(1)
+    for _ in range(600):
+        filter.update(counts(*(rng.randint(-9000, 9000) for _ in range(3)), gx=400, flags=1))
+    assert not filter.resting and not filter.mag_accepted
+
+
+def test_a_magnetometer_sample_that_cannot_be_is_not_used():
+    for bad in ((0, 0, 0), (32767, 0, 0), (-32768, 5, 5), (5, 5, -32767)):
+        filter = QuaternionKalman9(200, SCALE, 4096)
+        run(filter, counts(mx=bad[0], my=bad[1], mz=bad[2], flags=3), 200)
+        assert not filter.mag_accepted
+        out = array("i", [0] * 3)
+        filter.angles(out)
+        assert out[2] == 0
+
+
+def test_six_axes_do_not_look_at_the_magnetometer():
+    row, other = counts(flags=3), counts(mx=0, my=400, flags=3)
+    out = array("i", [0] * 3)
+    for kind in (QuaternionKalman6, QuaternionKalman9):
+        filter = kind(200, SCALE, 4096)
+        filter.set_quaternion(1, 0, 0, 1)
+        run(filter, row, 200)
+        filter.angles(out)
+        assert abs(out[2] - (90000 if kind is QuaternionKalman6 else 0)) < 3000
+        run(filter, other, 10)
+
+
+# -- what is refused
+@pytest.mark.parametrize("rate", [90, 100, (200, 1), (2000, 7), 500, 1000, (1000, 11)])
+@pytest.mark.parametrize("fsr", [250, 500, 1000, 2000])
+def test_every_rate_from_90_to_1000_hz_will_do(rate, fsr):
+    assert QuaternionKalman9(rate, SCALES[fsr], 2048, bias_start=10).rate[0]
+
+
+@pytest.mark.parametrize("rate", [49, 1440, 8000, 0, -200, (200, 0), 200.5, "200", None])
+def test_a_rate_that_the_numbers_cannot_hold_is_refused(rate):
+    with pytest.raises(ValueError, match=r"rate is .*, expected"):
+        QuaternionKalman9(rate, SCALES[250], 2048)
+
+
+def test_a_step_that_could_turn_by_too_much_is_refused():
+    with pytest.raises(ValueError, match=r"rate is 50 Hz, expected (\d+)..1439 Hz at") as caught:
+        QuaternionKalman9(50, SCALE, 2048)
+    low = int(re.search(r"expected (\d+)", str(caught.value)).group(1))
+    assert QuaternionKalman9(low, SCALE, 2048) and 50 < low <= 60
+    with pytest.raises(ValueError):
+        QuaternionKalman9(low - 1, SCALE, 2048)
+
+
+@pytest.mark.parametrize(
+    "parameters, said",
+    [
+        ({"gyro_noise": 0}, "gyro_noise is 0, expected 0.001..1"),
+        ({"mag_noise": 0.3}, "mag_noise is 0.3, expected 0.01..0.2"),
+        ({"bias_start": "6"}, "bias_start is '6', expected a number"),
+        ({"bias_walk": 0.1, "bias_start": 1}, "bias_walk is 0.1, expected no more than 1/20"),
+        ({"tau": 3}, "no parameter 'tau'"),
+    ],
+)
+def test_a_parameter_that_cannot_be_is_refused(parameters, said):
+    with pytest.raises((ValueError, TypeError), match=re.escape(said)):
+        QuaternionKalman9(200, SCALE, 2048, **parameters)
+
+
+@pytest.mark.parametrize("lsb", [0, 63, 32768, 2048.0])
+def test_an_accelerometer_scale_that_cannot_be_is_refused(lsb):
+    with pytest.raises(ValueError, match="accel_lsb_per_g"):
+        QuaternionKalman9(200, SCALE, lsb)
+    with pytest.raises(ValueError, match="axes"):
+        QuaternionKalman(200, SCALE, 2048, 7)
+
+
+def test_no_constant_shrinks_with_the_rate(history):
+    """The same 40 s at 90 and at 1000 Hz: the same errors, the same bias, at the same times."""
+    bias = (2, -3, 1)
+    found = {}
+    for rate in (90, 1000):
+        got = history(scene(rate, 40, all_axes, pushes, bias))
+        found[rate] = got.bias_dps[10 * rate :: 10 * rate] - bias
+    assert np.abs(found[90] - found[1000]).max() < 0.2

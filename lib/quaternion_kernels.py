@@ -1,0 +1,961 @@
+# Integer kernels of the quaternion Kalman filter (quaternion_kalman.py): the covariance, its propagation and scalar
+# measurements; rest and magnetic field. Needs the viper emitter of MicroPython, or CPython with a stand-in
+# `micropython` module. All of it is made for a hard interrupt: it allocates nothing, raises nothing, uses no float, and
+# gives the same bits on every port.
+#
+# The kernels work on the filter's state, one array('i') that starts as fixmath.py's (probe, quaternion, half angle;
+# `turn` needs no more). The error state x, true less estimated:
+#     0 1 2  attitude, rotation vector in the earth frame     2**-15 rad
+#     3 4 5  gyro bias in the body, times the block           2**-C rad; C such that bias_start is below 26000
+#     6 7    horizontal velocity / (g * block)                2**-10
+# In these units the covariance P fits 30 bits, every element of it (|P_ij| <= root of P_ii P_jj), and its propagation
+# over a block needs no multiplication but those with the rotation matrix. Estimates of x are held 10 bits finer.
+
+from array import array
+
+import micropython
+from micropython import const
+
+_PROBE = const(0)
+_Q = const(1)
+_O = const(17)  # 3: minus the bias as a half angle per step, Q31
+_OR = const(20)  # 3: its last bits, 2**-46, -32767..32767
+# the filter's own words, after fixmath's WR; quaternion_kalman.py has the same list
+_F = const(23)  # 3: correction of the next step in the earth frame, half angle, Q31
+_R = const(26)  # 9: rotation matrix; rows are north, west, up in the body; Q15
+_HS = const(35)  # 3: specific force in the earth frame, summed over the block, counts, Q9
+_AS = const(38)  # 3: accelerometer counts, summed
+_GS = const(41)  # 3: gyro counts, summed
+_MS = const(44)  # 3: magnetometer in the earth frame, summed, counts, Q9
+_MN = const(47)  # samples in it
+_BLOCK = const(49)  # log2 of the steps of a block
+_DECIDED = const(52)  # yes/no decisions, for the tests' float twin
+_T = const(55)  # 9: R at the end of the block
+_H = const(64)  # 3: the block's mean specific force in the earth frame, g, Q20
+_AM = const(67)  # 3: AS of the block
+_GM = const(70)  # 3: GS of the block
+_ML = const(73)  # 3: MS of the block
+_MLN = const(76)  # MN of the block
+_X = const(77)  # 8: estimated errors, not applied yet; 10 bits finer than P's units
+_V = const(85)  # 2: horizontal velocity, g * block, Q20
+_B = const(87)  # 3: learned bias, 2**-(C + 10) rad a block
+_P = const(90)  # 36: upper triangle of the covariance, row by row
+_N = const(126)  # 9: attitude-bias part of P, mean of before and after the block
+_ROW = const(135)  # 8: row of P of what is measured
+_M = const(143)  # 8: gain of error i = M / 2**(E + 15), M of 28 to 31 bits
+_E = const(151)  # 8
+_FOLDED = const(159)  # 3: correction that the new block starts with, rad, Q25
+_UH = const(162)  # which error is measured ...
+_UE = const(163)  # ... its measured value, in X's units ...
+_UR = const(164)  # ... its variance / 16, in P's units ...
+_UM = const(165)  # ... bits of the errors that it must not correct
+_OVER = const(166)  # 1: it was beyond 2.5 sigma
+_MEANT = const(249)  # 2: tilt from the accelerometer as it is, X's units
+_HG = const(168)  # HS to H: HG / 2**HG_SHIFT
+_HG_SHIFT = const(169)
+_C = const(170)  # C - 15
+_B_SHIFT = const(171)  # B to half angle per step, Q31
+_B_MOST = const(172)
+_QT = const(173)  # variance that a block adds to the attitude, 2**-16 of P's unit ...
+_QTR = const(174)  # ... and what is carried of it
+_QB = const(175)  # the same for the bias, 2**-12
+_QBR = const(176)
+_QS = const(177)  # variance per (4 counts)**2 of the gyro: QS / 2**QS_SHIFT
+_QS_SHIFT = const(178)
+_BS = const(179)  # first variance of the bias
+_RV = const(180)  # variances / 16: velocity ...
+_RM = const(181)  # ... heading from one block ...
+_RA = const(183)  # ... accelerometer believed as it is
+_V0 = const(184)  # first variance of the velocity
+_LOW1 = const(185)  # 6: first low-pass of accelerometer, gyro less base; counts, Q12
+_LOW2 = const(191)  # 6: second
+_BASE = const(197)  # 3: gyro bias that was set, 1/256 count
+_O_BASE = const(200)  # 3: O of BASE alone
+_OR_BASE = const(203)  # 3: its last bits
+_Z = const(206)  # 3: low-passed gyro in B's units
+_BLOCKS = const(209)  # of the rest detector's start
+_STILL = const(210)  # blocks without motion, no more than REST_AFTER
+_REST_AFTER = const(211)
+_REST_K = const(212)  # Q15
+_REST_GYRO = const(213)  # counts**2, Q6
+_REST_ACCEL = const(214)  # counts**2, Q6
+_REST_MOST = const(215)  # most that is taken for a bias, counts, Q12
+_REST_OFF = const(216)  # most that a known bias may be off, B's units
+_KNOWN = const(217)  # variance of a known bias
+_CB = const(218)  # counts (Q12) to B's units: CB / 2**CB_SHIFT
+_CB_SHIFT = const(219)
+_WIDE_FOR = const(
+    221
+)  # blocks for which the accelerometer has been believed as it is; then 2, 1, 0
+_WIDE_MOST = const(222)
+_LOST = const(223)  # blocks with the velocity beyond 2.5 sigma
+_LOST_MOST = const(224)
+_SINCE = const(225)  # blocks since the last with a magnetometer sample
+_J = const(226)  # blocks that the heading of this block stands for; 0: none
+_ERR = const(227)  # heading error, rad, Q25
+_NOW = const(228)  # 2: horizontal and vertical field, counts, Q13
+_FIELD = const(230)  # 2: smoothed
+_REF = const(232)  # 2: reference
+_HAVE = const(234)  # 1: there is one
+_NEAR = const(235)  # blocks near the reference, no more than FIELD_AFTER
+_AGE = const(236)  # blocks with a field, no more than 16384
+_FAR = const(237)  # blocks of large heading error
+_FIELD_AFTER = const(238)
+_TOL = const(240)  # tolerance squared, Q14
+_SMOOTH = const(241)  # blocks of 0.05 s, Q10
+_TAU = const(242)  # blocks of the reference's time constant, Q10
+_TAU_FAR = const(243)  # the same while the field is another
+_FAR_MOST = const(244)
+_GOOD = const(245)  # 1: the field is that of the reference; 2: there is no reference yet
+_FIRST = const(246)  # blocks after which there is one
+_NOISE = const(247)  # variance / 16 of the heading
+_TAU_0 = const(248)  # blocks of 0.2 s, Q10
+WORDS = const(251)
+
+_STILL_BIT = const(1)
+_NEAR_BIT = const(2)
+_FAR_BIT = const(4)
+_WIDE = const(8)
+_RUNAWAY = const(16)
+_UNDER = const(32)
+_LEAN = const(64)
+_UPSET = const(128)
+_DOUBTED = const(256)
+
+_CAP = const(687194767)  # 0.64 of the largest variance, Q30
+OPEN = const(603979776)  # variance of an attitude of which nothing is known: (0.75 rad)**2
+_WIDE_SUM = const(147102629)  # 2 (15 deg)**2, Q30
+_WIDE_ONE = const(73551315)
+_LEAN_ONE = const(131533373)  # (20 deg)**2, Q30
+_FOLD_MOST = const(11744051)  # 0.35 rad, Q25
+_V_MOST = const(1072693248)  # 1023, Q20
+_FAR_RAD = const(18454938)  # 0.55, Q25
+_PI25 = const(105414357)
+_LEAST = const(16)  # no variance falls below
+
+# where P_ij stands in the triangle: _AT[8 i + j]
+_AT = array(
+    "B",
+    [
+        8 * min(i, j) - min(i, j) * (min(i, j) + 1) // 2 + max(i, j)
+        for i in range(8)
+        for j in range(8)
+    ],
+)
+
+# atan(2**-i) in rad, Q28
+# fmt: off
+_ATAN = array("i", [
+    210828714, 124459457, 65760959, 33381290, 16755422, 8385879, 4193963, 2097109, 1048571,
+    524287, 262144, 131072, 65536, 32768, 16384, 8192, 4096, 2048, 1024, 512,
+])
+# fmt: on
+
+
+# ------------------------------------------------------------------------------------------ every step
+@micropython.viper
+def level(s: ptr32, counts: ptr16):
+    """R of Q; the specific force in the earth frame, R a, and the counts themselves go into the block's sums.
+
+    a is as measured: neither normalised nor left out at full scale, so that what comes in swings cancels.
+    """
+    k = 0
+    if s[_PROBE] > 0:
+        k = 32
+    a = ((s[_Q] << k >> k) + 8192) >> 14
+    b = ((s[_Q + 1] << k >> k) + 8192) >> 14
+    c = ((s[_Q + 2] << k >> k) + 8192) >> 14
+    d = ((s[_Q + 3] << k >> k) + 8192) >> 14
+    x = ((counts[0] & 0xFFFF) ^ 0x8000) - 0x8000
+    y = ((counts[1] & 0xFFFF) ^ 0x8000) - 0x8000
+    z = ((counts[2] & 0xFFFF) ^ 0x8000) - 0x8000
+    s[_AS] = (s[_AS] << k >> k) + x
+    s[_AS + 1] = (s[_AS + 1] << k >> k) + y
+    s[_AS + 2] = (s[_AS + 2] << k >> k) + z
+    m = 32768 - ((c * c + d * d + 8192) >> 14)
+    n = (b * c - a * d + 8192) >> 14
+    o = (b * d + a * c + 8192) >> 14
+    s[_R] = m
+    s[_R + 1] = n
+    s[_R + 2] = o
+    s[_HS] = (s[_HS] << k >> k) + ((m * x + n * y + o * z + 32) >> 6)
+    m = (b * c + a * d + 8192) >> 14
+    n = 32768 - ((b * b + d * d + 8192) >> 14)
+    o = (c * d - a * b + 8192) >> 14
+    s[_R + 3] = m
+    s[_R + 4] = n
+    s[_R + 5] = o
+    s[_HS + 1] = (s[_HS + 1] << k >> k) + ((m * x + n * y + o * z + 32) >> 6)
+    m = (b * d - a * c + 8192) >> 14
+    n = (c * d + a * b + 8192) >> 14
+    o = 32768 - ((b * b + c * c + 8192) >> 14)
+    s[_R + 6] = m
+    s[_R + 7] = n
+    s[_R + 8] = o
+    s[_HS + 2] = (s[_HS + 2] << k >> k) + ((m * x + n * y + o * z + 32) >> 6)
+
+
+@micropython.viper
+def gather(s: ptr32, counts: ptr16):
+    """Add a magnetometer sample, turned into the earth frame, to the block's sum.
+
+    Left out: all zero, an axis at full scale.
+    """
+    k = 0
+    if s[_PROBE] > 0:
+        k = 32
+    x = ((counts[6] & 0xFFFF) ^ 0x8000) - 0x8000
+    y = ((counts[7] & 0xFFFF) ^ 0x8000) - 0x8000
+    z = ((counts[8] & 0xFFFF) ^ 0x8000) - 0x8000
+    if (x | y | z) == 0:
+        return
+    if x > 32766 or y > 32766 or z > 32766 or x < -32766 or y < -32766 or z < -32766:
+        return
+    s[_MN] += 1
+    t = (s[_R] << k >> k) * x + (s[_R + 1] << k >> k) * y + (s[_R + 2] << k >> k) * z
+    s[_MS] = (s[_MS] << k >> k) + ((t + 32) >> 6)
+    t = (s[_R + 3] << k >> k) * x + (s[_R + 4] << k >> k) * y + (s[_R + 5] << k >> k) * z
+    s[_MS + 1] = (s[_MS + 1] << k >> k) + ((t + 32) >> 6)
+    t = (s[_R + 6] << k >> k) * x + (s[_R + 7] << k >> k) * y + (s[_R + 8] << k >> k) * z
+    s[_MS + 2] = (s[_MS + 2] << k >> k) + ((t + 32) >> 6)
+
+
+# ------------------------------------------------------------------------------------------ end of a block
+@micropython.viper
+def close(s: ptr32):
+    """Take over the block's sums and the attitude at its end, and begin new ones."""
+    k = 0
+    if s[_PROBE] > 0:
+        k = 32
+    i = 0
+    while i < 9:
+        s[_T + i] = s[_R + i]
+        i += 1
+    gain = s[_HG]
+    shift = s[_HG_SHIFT]
+    i = 0
+    while i < 3:
+        x = s[_HS + i] << k >> k
+        m = x >> 15
+        x -= m << 15
+        if shift < 15:
+            x = (m * gain << 15 - shift) + (x * gain >> shift)
+        else:
+            x = m * gain + (x * gain >> 15) + (1 << shift - 15 >> 1) >> shift - 15
+        s[_H + i] = x
+        s[_HS + i] = 0
+        s[_AM + i] = s[_AS + i]
+        s[_AS + i] = 0
+        s[_GM + i] = s[_GS + i]
+        s[_GS + i] = 0
+        s[_ML + i] = s[_MS + i]
+        s[_MS + i] = 0
+        i += 1
+    s[_MLN] = s[_MN]
+    s[_MN] = 0
+
+
+@micropython.viper
+def carry(s: ptr32):
+    """Carry the errors found in the last block through this one, as the errors themselves went, and apply them.
+
+    attitude -= R bias; velocity += attitude x up. Then bias and velocity take theirs at once, the attitude with the
+    next step: FOLDED, F; what is more than 0.35 rad stays for the blocks to come.
+    """
+    k = 0
+    if s[_PROBE] > 0:
+        k = 32
+    x = s[_X + 3] << k >> k
+    y = s[_X + 4] << k >> k
+    z = s[_X + 5] << k >> k
+    a = x >> 14
+    b = y >> 14
+    c = z >> 14
+    x -= a << 14
+    y -= b << 14
+    z -= c << 14
+    shift = s[_C] + 1
+    half = 1 << shift >> 1
+    i = 0
+    while i < 3:
+        m = s[_T + 3 * i] << k >> k
+        n = s[_T + 3 * i + 1] << k >> k
+        o = s[_T + 3 * i + 2] << k >> k
+        m = a * m + b * n + c * o + (x * m + y * n + z * o >> 14)
+        s[_X + i] = (s[_X + i] << k >> k) - (m + half >> shift)
+        i += 1
+    shift = s[_B_SHIFT]
+    m = ((s[_X + 1] << k >> k) + 16 >> 5) + (s[_H] << k >> k) + (s[_X + 6] << k >> k)
+    n = (s[_H + 1] << k >> k) + (s[_X + 7] << k >> k) - ((s[_X] << k >> k) + 16 >> 5)
+    i = 0
+    while i < 3:
+        x = s[_X + i] << k >> k
+        y = x
+        if y > _FOLD_MOST:
+            y = _FOLD_MOST
+        elif y < 0 - _FOLD_MOST:
+            y = 0 - _FOLD_MOST
+        s[_X + i] = x - y
+        s[_FOLDED + i] = y
+        s[_F + i] = y << 5
+        x = (s[_B + i] << k >> k) + (s[_X + 3 + i] << k >> k)
+        s[_X + 3 + i] = 0
+        if x > s[_B_MOST]:
+            x = s[_B_MOST]
+        elif x < 0 - s[_B_MOST]:
+            x = 0 - s[_B_MOST]
+        s[_B + i] = x
+        y = x >> shift
+        s[_O + i] = (s[_O_BASE + i] << k >> k) - y
+        s[_OR + i] = (s[_OR_BASE + i] << k >> k) - (x - (y << shift) << 15 - shift)
+        i += 1
+    i = 0
+    while i < 2:
+        x = (s[_V + i] << k >> k) + m
+        m = n
+        if x > _V_MOST:
+            x = _V_MOST
+        elif x < 0 - _V_MOST:
+            x = 0 - _V_MOST
+        s[_V + i] = x
+        s[_X + 6 + i] = 0
+        i += 1
+
+
+# ------------------------------------------------------------------------------------------ covariance of a block
+@micropython.viper
+def spread(s: ptr32):
+    """Attitude -= R bias, in the columns of bias and velocity: P_ab -= R P_bb, P_av -= R P_bv. N for `swell`."""
+    k = 0
+    if s[_PROBE] > 0:
+        k = 32
+    at = ptr8(_AT)
+    shift = s[_C]
+    half = 1 << shift >> 1
+    j = 3
+    while j < 8:
+        x = s[_P + at[24 + j]] << k >> k
+        y = s[_P + at[32 + j]] << k >> k
+        z = s[_P + at[40 + j]] << k >> k
+        a = x + 16384 >> 15
+        b = y + 16384 >> 15
+        c = z + 16384 >> 15
+        x -= a << 15
+        y -= b << 15
+        z -= c << 15
+        i = 0
+        while i < 3:
+            m = s[_T + 3 * i] << k >> k
+            n = s[_T + 3 * i + 1] << k >> k
+            o = s[_T + 3 * i + 2] << k >> k
+            m = a * m + b * n + c * o + (x * m + y * n + z * o + 16384 >> 15)
+            o = _P + at[8 * i + j]
+            n = s[o] << k >> k
+            if j < 6:
+                s[_N + 3 * i + j - 3] = n - (m + (half << 1) >> shift + 1)
+            s[o] = n - (m + half >> shift)
+            i += 1
+        j += 1
+
+
+@micropython.viper
+def swell(s: ptr32):
+    """The same in the attitude's own part: P_aa -= N R' + R N', where N is P_ab halfway through the block."""
+    k = 0
+    if s[_PROBE] > 0:
+        k = 32
+    at = ptr8(_AT)
+    shift = s[_C] - 1
+    half = 1 << shift >> 1
+    i = 0
+    while i < 3:
+        j = i
+        while j < 3:
+            total = half
+            u = 3 * i
+            v = 3 * j
+            n = 0
+            while n < 2:
+                x = s[_N + u] << k >> k
+                y = s[_N + u + 1] << k >> k
+                z = s[_N + u + 2] << k >> k
+                a = x + 16384 >> 15
+                b = y + 16384 >> 15
+                c = z + 16384 >> 15
+                x -= a << 15
+                y -= b << 15
+                z -= c << 15
+                o = s[_T + v] << k >> k
+                a = a * o
+                x = x * o
+                o = s[_T + v + 1] << k >> k
+                a += b * o
+                x += y * o
+                o = s[_T + v + 2] << k >> k
+                a += c * o + (x + z * o + 16384 >> 15)
+                total += a >> 1
+                u = v
+                v = 3 * i
+                n += 1
+            o = _P + at[8 * i + j]
+            s[o] = (s[o] << k >> k) - (total >> shift)
+            j += 1
+        i += 1
+
+
+@micropython.viper
+def run(s: ptr32):
+    """Velocity += attitude x up: v0 += a1, v1 -= a0."""
+    k = 0
+    if s[_PROBE] > 0:
+        k = 32
+    at = ptr8(_AT)
+    a = s[_P]
+    b = s[_P + 1] << k >> k
+    c = s[_P + 8]
+    s[_P + 33] += ((s[_P + 13] << k >> k) << 1) + (c + 16 >> 5) + 16 >> 5
+    s[_P + 35] += (a + 16 >> 5) - ((s[_P + 7] << k >> k) << 1) + 16 >> 5
+    m = (s[_P + 14] << k >> k) - (s[_P + 6] << k >> k) - (b + 16 >> 5)
+    s[_P + 34] = (s[_P + 34] << k >> k) + (m + 16 >> 5)
+    i = 0
+    while i < 6:
+        a = s[_P + at[8 + i]] << k >> k
+        b = s[_P + at[i]] << k >> k
+        c = _P + at[8 * i + 6]
+        s[c] = (s[c] << k >> k) + (a + 16 >> 5)
+        c += 1
+        s[c] = (s[c] << k >> k) - (b + 16 >> 5)
+        i += 1
+
+
+@micropython.viper
+def noise(s: ptr32):
+    """What a block adds to the variances: gyro noise, the gyro's scale errors, wandering of the bias.
+
+    Where a variance would outgrow its 30 bits, all of its row is halved (a quarter of the variance): a congruence, so
+    P stays a covariance.
+    """
+    k = 0
+    if s[_PROBE] > 0:
+        k = 32
+    at = ptr8(_AT)
+    fine = s[_BLOCK]
+    m = 0
+    i = 0
+    while i < 3:
+        x = ((s[_GM + i] << k >> k) << 2 >> fine) - ((s[_BASE + i] << k >> k) >> 6) >> 4
+        m += x * x
+        i += 1
+    x = m >> 15
+    m = x * s[_QS] + ((m - (x << 15)) * s[_QS] >> 15) >> s[_QS_SHIFT] - 15
+    x = s[_QTR] + s[_QT]
+    s[_QTR] = x & 65535
+    x >>= 16
+    s[_P] += x + m
+    s[_P + 8] += x + m
+    s[_P + 15] += x + (m >> 4)
+    x = s[_QBR] + s[_QB]
+    s[_QBR] = x & 4095
+    x >>= 12
+    i = 3
+    while i < 6:
+        m = _P + at[9 * i]
+        if s[m] < s[_BS]:
+            s[m] += x
+        i += 1
+    i = 0
+    while i < 8:
+        m = _P + at[9 * i]
+        if s[m] > _CAP:
+            j = 0
+            while j < 8:
+                n = _P + at[8 * i + j]
+                s[n] = (s[n] << k >> k) + 1 >> 1
+                j += 1
+            s[m] >>= 1
+        i += 1
+
+
+@micropython.viper
+def open_up(s: ptr32, i: int, variance: int):
+    """Nothing is known of error i any more, but its size."""
+    at = ptr8(_AT)
+    j = 0
+    while j < 8:
+        s[_P + at[8 * i + j]] = 0
+        j += 1
+    s[_P + at[9 * i]] = variance
+    s[_X + i] = 0
+
+
+# ------------------------------------------------------------------------------------------ a measurement
+@micropython.viper
+def gain(s: ptr32):
+    """Error UH is UE, with variance 16 UR: gains of all errors, and what they make of X.
+
+    The innovation is bounded by 5 sigma. Gain of i: P_ih / (P_hh + r), as a mantissa and a shift of its own.
+    """
+    k = 0
+    if s[_PROBE] > 0:
+        k = 32
+    at = ptr8(_AT)
+    h = s[_UH]
+    mask = s[_UM]
+    n = s[_P + at[9 * h]] + 8 >> 4
+    n += s[_UR]
+    f = 0
+    while n < 0xC000000:
+        n <<= 2
+        f += 2
+    # root: a line, then Heron twice; 5 sigma in X's units is 5 * 2**10 * 4 times the root
+    r = ((n >> 15) * 21845 >> 15) + 11403
+    r = (r + n // r) >> 1
+    r = (r + n // r) >> 1
+    r = 20480 * r >> (f >> 1)
+    e = (s[_UE] << k >> k) - (s[_X + h] << k >> k)
+    c = r >> 1
+    s[_OVER] = 0
+    if e > c or e < 0 - c:
+        s[_OVER] = 1
+    if e > r:
+        e = r
+    elif e < 0 - r:
+        e = 0 - r
+    c = e >> 15
+    e &= 32767
+    # 1 / n = (r + d / 2**15) / 2**43: a quotient of 14 bits, and Newton's step for the rest
+    r = 0x1FFFFFFF // (n + 8192 >> 14)
+    h = n >> 15
+    d = 0x10000000 - r * h - (r * (n - (h << 15)) >> 15)
+    d = d * (r >> 1) >> 12
+    r += d >> 15
+    d &= 32767
+    i = 0
+    while i < 8:
+        x = s[_P + at[8 * s[_UH] + i]] << k >> k
+        s[_ROW + i] = x
+        a = x
+        if a < 0:
+            a = 0 - a
+        m = 0
+        n = 44
+        if a:
+            n = 17 - f
+            while a < 0x20000000:
+                a <<= 1
+                n += 1
+            if n < 45:
+                h = a >> 15
+                m = h * r + (h * d >> 15) + ((a - (h << 15)) * r >> 15)
+                if x < 0:
+                    m = 0 - m
+            else:
+                n = 44  # too little to move anything
+        s[_M + i] = m
+        s[_E + i] = n
+        if (mask >> i) & 1 == 0:
+            h = m >> 15
+            m -= h << 15
+            m = c * m + e * h
+            if n < 15:
+                m = (c * h << 15 - n) + (m >> n)
+            else:
+                n -= 15
+                m = c * h + (m >> 15) + (1 << n >> 1) >> n
+            s[_X + i] = (s[_X + i] << k >> k) + m
+        i += 1
+
+
+@micropython.viper
+def shrink(s: ptr32):
+    """P_ij -= gain_i P_jh, but for pairs of which neither must be corrected (Schmidt's form)."""
+    k = 0
+    if s[_PROBE] > 0:
+        k = 32
+    mask = s[_UM]
+    p = _P
+    i = 0
+    while i < 8:
+        m = s[_M + i] << k >> k
+        o = m >> 15
+        n = s[_E + i]
+        if m == 0:
+            p += 8 - i
+        else:
+            m -= o << 15
+            fixed = (mask >> i) & 1
+            down = n - 15
+            half = 0
+            if down > 0:
+                half = 1 << down >> 1
+            j = i
+            while j < 8:
+                if ((mask >> j) & fixed) == 0:
+                    x = s[_ROW + j] << k >> k
+                    h = x + 16384 >> 15
+                    x = h * m + (x - (h << 15)) * o
+                    if down < 0:
+                        x = (h * o << 0 - down) + (x >> n)
+                    else:
+                        x = h * o + (x >> 15) + half >> down
+                    s[p] = (s[p] << k >> k) - x
+                p += 1
+                j += 1
+            j = p + i - 8
+            if (s[j] << k >> k) < _LEAST:
+                s[j] = _LEAST
+        i += 1
+
+
+# ------------------------------------------------------------------------------------------ what is measured
+@micropython.viper
+def rest(s: ptr32):
+    """Rest: gyro and accelerometer stay near their two-pole low-passes, the gyro near its bias where that is known.
+
+    At rest a tilt error that cannot be opens the attitude up.
+    """
+    k = 0
+    if s[_PROBE] > 0:
+        k = 32
+    at = ptr8(_AT)
+    rate = s[_REST_K]
+    i = s[_BLOCKS] + 1
+    if i * rate < 32768:
+        s[_BLOCKS] = i
+        rate = 32768 // i  # the mean of all, until the low-pass takes over
+    fine = 12 - s[_BLOCK]
+    still = 1
+    total = 0
+    i = 0
+    while i < 6:
+        x = (s[_AM + i] << k >> k) << fine
+        if i > 2:
+            x -= (s[_BASE + i - 3] << k >> k) << 4
+        f = s[_LOW1 + i] << k >> k
+        v = x - f
+        h = v >> 15
+        f += h * rate + ((v - (h << 15)) * rate + 16384 >> 15)
+        s[_LOW1 + i] = f
+        v = s[_LOW2 + i] << k >> k
+        f -= v
+        h = f >> 15
+        v += h * rate + ((f - (h << 15)) * rate + 16384 >> 15)
+        s[_LOW2 + i] = v
+        x = x - v >> 9
+        if x < 0:
+            x = 0 - x
+        if x > 16383:
+            x = 16383
+        total += x * x
+        if i == 2:
+            if total >= s[_REST_ACCEL]:
+                still = 0
+            total = 0
+        if i > 2:
+            f = s[_REST_MOST]
+            if v > f:
+                v = f
+                still = 0
+            elif v < 0 - f:
+                v = 0 - f
+                still = 0
+            h = v >> 13
+            v -= h << 13
+            f = s[_CB_SHIFT]
+            h = h * s[_CB]
+            v = v * s[_CB]
+            if f < 13:
+                v = (h << 13 - f) + (v >> f)
+            else:
+                v = h + (v >> 13) >> f - 13
+            s[_Z + i - 3] = v
+            v -= s[_B + i - 3] << k >> k
+            if v < 0:
+                v = 0 - v
+            if s[_P + at[9 * i]] < s[_KNOWN] and v > s[_REST_OFF]:
+                still = 0
+        i += 1
+    decided = (s[_DECIDED] | (_STILL_BIT | _UPSET)) ^ _UPSET
+    i = 0
+    if still and total < s[_REST_GYRO]:
+        i = s[_STILL] + 1
+        if i > s[_REST_AFTER]:
+            i = s[_REST_AFTER]
+    else:
+        decided ^= _STILL_BIT
+    s[_STILL] = i
+    x = (s[_H] << k >> k) >> 10
+    v = (s[_H + 1] << k >> k) >> 10
+    if i == s[_REST_AFTER]:
+        if x > 256 or x < -256 or v > 256 or v < -256 or x * x + v * v > 65536:
+            decided |= _UPSET
+    s[_DECIDED] = decided
+
+
+@micropython.viper
+def tilted(s: ptr32):
+    """WIDE: whether the accelerometer is believed as it is; MEANT: what it then says of the tilt."""
+    k = 0
+    if s[_PROBE] > 0:
+        k = 32
+    decided = (s[_DECIDED] | (_WIDE | _UNDER | _LEAN)) ^ (_WIDE | _UNDER | _LEAN)
+    if s[_P] + s[_P + 8] > _WIDE_SUM:
+        decided |= _WIDE
+        most = 0
+        total = 0
+        i = 0
+        while i < 2:
+            x = s[_H + 1 - i] << k >> k
+            if i:
+                x = 0 - x
+            if x > 0x200000:
+                x = 0x200000
+            elif x < -0x200000:
+                x = -0x200000
+            s[_M + i] = x
+            if x < 0:
+                x = 0 - x
+            if x > most:
+                most = x
+            total += (x >> 8) * (x >> 8)
+            i += 1
+        if total > 167772:  # (0.1 g)**2
+            decided |= _LEAN
+        if (s[_H + 2] << k >> k) < 0:
+            decided |= _UNDER
+            most += 1024
+            if most < 0x180000:
+                # at least 1.5 rad, in the direction that there is
+                i = 0
+                while i < 2:
+                    x = (s[_M + i] << k >> k) << 9
+                    y = x // most
+                    x = (y << 9) + (x - y * most << 9) // most
+                    s[_M + i] = x * 6
+                    i += 1
+        s[_MEANT] = ((s[_M] << k >> k) << 5) - (s[_FOLDED] << k >> k)
+        s[_MEANT + 1] = ((s[_M + 1] << k >> k) << 5) - (s[_FOLDED + 1] << k >> k)
+    s[_DECIDED] = decided
+
+
+@micropython.viper
+def settle(s: ptr32) -> int:
+    """After both measurements of the tilt -> what to open up: bit 0 attitude, bit 1 velocity."""
+    decided = s[_DECIDED]
+    if decided & _WIDE:
+        i = s[_WIDE_FOR] + 1
+        if i > s[_WIDE_MOST]:
+            i = s[_WIDE_MOST]
+        s[_WIDE_FOR] = i
+        if decided & _UNDER or (decided & _LEAN and i < s[_WIDE_MOST]):
+            if s[_P] < _LEAN_ONE:
+                s[_P] = _LEAN_ONE
+            if s[_P + 8] < _LEAN_ONE:
+                s[_P + 8] = _LEAN_ONE
+        s[_V] = 0
+        s[_V + 1] = 0
+        s[_LOST] = 0
+        return 2
+    i = s[_WIDE_FOR]
+    if i > 3:
+        i = 3
+    if i:
+        s[_WIDE_FOR] = (
+            i - 1
+        )  # the last correction has to come through before the heading means something
+    i = 0
+    if decided & _RUNAWAY:
+        i = s[_LOST] + 1
+    s[_LOST] = i
+    if i > s[_LOST_MOST]:
+        s[_LOST] = 0
+        return 1
+    return 0
+
+
+@micropython.viper
+def compass(s: ptr32):
+    """ERR: the heading error, from the block's mean field; NOW: its horizontal and vertical part. CORDIC."""
+    k = 0
+    if s[_PROBE] > 0:
+        k = 32
+    n = s[_MLN]
+    j = s[_SINCE] + 1
+    if j > 16:
+        j = 16
+    s[_SINCE] = j
+    s[_J] = 0
+    if n == 0:
+        return
+    s[_J] = j
+    s[_SINCE] = 0
+    x = (s[_ML] << k >> k) // n << 4
+    y = 0 - ((s[_ML + 1] << k >> k) // n << 4)
+    s[_NOW + 1] = (s[_ML + 2] << k >> k) // n << 4
+    angle = 0
+    if x < 0:
+        angle = _PI25 << 3
+        if y < 0:
+            angle = 0 - angle
+        x = 0 - x
+        y = 0 - y
+    t = y
+    if t < 0:
+        t = 0 - t
+    if x + t == 0:
+        s[_ERR] = 0
+        s[_NOW] = 0
+        return
+    shift = 0
+    while x + t < 0x10000000:
+        x <<= 1
+        y <<= 1
+        t <<= 1
+        shift += 1
+    table = ptr32(_ATAN)
+    i = 0
+    while i < 20:
+        t = y >> i
+        if y > 0:
+            y -= x >> i
+            x += t
+            angle += table[i]
+        else:
+            y += x >> i
+            x -= t
+            angle -= table[i]
+        i += 1
+    s[_ERR] = angle + 4 >> 3
+    # x is 1.64676 times the length
+    t = x >> 15
+    s[_NOW] = t * 19898 + ((x - (t << 15)) * 19898 >> 15) >> shift
+
+
+@micropython.viper
+def field(s: ptr32):
+    """GOOD: whether the field is that of its reference, which follows; NOISE: the less it is, the larger."""
+    k = 0
+    if s[_PROBE] > 0:
+        k = 32
+    j = s[_J]
+    rate = (j << 24) // ((j << 10) + s[_SMOOTH])  # Q14
+    i = 0
+    while i < 2:
+        x = s[_NOW + i] << k >> k
+        if s[_HAVE] == 0:
+            s[_FIELD + i] = x
+            s[_REF + i] = x
+        y = s[_FIELD + i] << k >> k
+        x -= y
+        n = x >> 14
+        s[_FIELD + i] = y + n * rate + ((x - (n << 14)) * rate >> 14)
+        i += 1
+    s[_HAVE] = 1
+    decided = s[_DECIDED] | _NEAR_BIT
+    # squared distances from the reference, as a part of it, Q14: of the smoothed field, of this one
+    off = 0
+    i = 2
+    while i >= 0:
+        x = s[_REF] << k >> k
+        y = s[_REF + 1] << k >> k
+        n = (s[_NOW + i] << k >> k) - x
+        m = (s[_NOW + 1 + i] << k >> k) - y
+        if y < 0:
+            y = 0 - y
+        if n < 0:
+            n = 0 - n
+        if m < 0:
+            m = 0 - m
+        while (x | y | n | m) > 16383:
+            x >>= 1
+            y >>= 1
+            n >>= 1
+            m >>= 1
+        off = (n * n + m * m) // ((x * x + y * y >> 14) + 1)
+        if i and off >= s[_TOL]:
+            decided ^= _NEAR_BIT
+        i -= 2
+    s[_DECIDED] = decided
+    n = s[_RM] // j
+    if off > 1310:
+        off = 1310
+    n += (n >> 10) * (off * 100 >> 4)
+    if n > 0x20000000:
+        n = 0x20000000
+    s[_NOISE] = n
+    near = 0
+    tau = s[_TAU_FAR]
+    s[_GOOD] = 0
+    if decided & _NEAR_BIT:
+        near = s[_NEAR] + j
+        if near >= s[_FIELD_AFTER]:
+            near = s[_FIELD_AFTER]
+            tau = s[_TAU]
+            s[_GOOD] = 1
+    s[_NEAR] = near
+    n = s[_AGE] + j
+    if n > 16384:
+        n = 16384
+    s[_AGE] = n
+    if n <= s[_FIRST] and s[_GOOD] == 0:
+        s[_GOOD] = 2
+    n = (n << 10) + s[_TAU_0]
+    if tau > n:
+        tau = n
+    rate = (j << 26) // ((j << 10) + tau >> 4)  # Q20
+    i = 0
+    while i < 2:
+        y = s[_REF + i] << k >> k
+        x = (s[_FIELD + i] << k >> k) - y
+        n = x >> 15
+        x -= n << 15
+        if rate > 65535:
+            m = rate >> 5
+            y += n * m + (x * m >> 15)
+        else:
+            y += n * rate + (x * rate >> 15) + 16 >> 5
+        s[_REF + i] = y
+        i += 1
+
+
+@micropython.viper
+def steer(s: ptr32) -> int:
+    """Make ready to measure the heading -> 0: not now, 1: do; 3: and open it up before."""
+    k = 0
+    if s[_PROBE] > 0:
+        k = 32
+    j = s[_J]
+    if j == 0 or s[_GOOD] == 0 or s[_WIDE_FOR]:
+        return 0
+    decided = (s[_DECIDED] | (_DOUBTED | _FAR_BIT)) ^ (_DOUBTED | _FAR_BIT)
+    n = s[_NOISE]
+    if s[_P + 15] > _WIDE_ONE:
+        decided |= _DOUBTED
+        if n > 4026532:  # 0.06 rad**2
+            n = 4026532
+    s[_UR] = n
+    e = s[_ERR] << k >> k
+    if e > _FAR_RAD or e < 0 - _FAR_RAD:
+        decided |= _FAR_BIT
+    s[_DECIDED] = decided
+    n = s[_FAR]
+    found = 1
+    if decided & _FAR_BIT and s[_GOOD] == 1:
+        n += j
+        if n > s[_FAR_MOST]:
+            n = 0
+            found = 3
+            s[_X + 2] = 0
+    else:
+        n -= j
+        if n < 0:
+            n = 0
+    s[_FAR] = n
+    x = s[_X + 2] << k >> k
+    e -= (s[_FOLDED + 2] << k >> k) + x
+    if e > _PI25:
+        e -= _PI25 << 1
+    elif e < 0 - _PI25:
+        e += _PI25 << 1
+    s[_UE] = e + x
+    return found
