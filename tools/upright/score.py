@@ -317,7 +317,7 @@ def summary_table(report: Report) -> Table:
     """Mean, median and worst over the trials; one row a filter."""
     table = Table(box=None, pad_edge=False)
     table.add_column("RMSE in deg\nfilter", no_wrap=True)
-    table.add_column("\ntrials", justify="right")
+    table.add_column("\nn", justify="right")
     for figure in FIGURES:
         table.add_column(f"{figure}\n mean   med worst", no_wrap=True)
     for name in report.names("filter"):
