@@ -20,6 +20,7 @@ from upright import (
     baselines,
     filter_costs,
     plotting,
+    registry,
     replay,
     runtimes,
     score,
@@ -62,11 +63,11 @@ class Comparison:
 def choose(filters: str | None, with_baselines: bool, notes: list) -> list[str]:
     """The names to compare, all of the registry unless some are asked for. Raises score.ScoreError."""
     names = (
-        score.filter_names()
+        registry.filters()
         if filters is None
         else [name.strip() for name in filters.split(",") if name.strip()]
     )
-    hardware = score.filter_names("HARDWARE")
+    hardware = registry.hardware()
     left_out = [name for name in names if name in hardware]
     if left_out:
         notes.append(

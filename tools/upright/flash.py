@@ -18,11 +18,10 @@ from mpremote.transport import TransportError, TransportExecError
 from rich.console import Console
 from rich.progress import Progress
 
-from upright import __version__, device, packages, paths, runtimes
+from upright import __version__, device, packages, paths, registry, runtimes
 
 RECORD = "upright.json"  # on the board: what was installed, {"version": , "files": {name: sha256}}
 JOURNAL, NEW = "update.json", ".new"  # as in firmware/update.py
-FILTERS = paths.FIRMWARE / "filters.py"
 # Sources on the board as well: the first two are run, not imported; the third is there to be edited.
 SOURCES = ("boot.py", "main.py", "board.py")
 # A user's own, if it is not what was installed: kept, unless --force
@@ -90,7 +89,7 @@ def library(text: str) -> set[str]:
 
     Of the filters the one that it names; without one, the firmware's default; where its name is worked out, all.
     """
-    module = {name: module for name, (module, _) in setting(FILTERS.read_text(), "FILTERS").items()}
+    module = {name: module for name, (module, _) in registry.filters().items()}
     try:
         chosen = setting(text, "FILTER")
         wanted = {module[chosen]} if chosen in module else {module["inertial9"]}

@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from upright import paths, plotting, replay, score, simulate, trials
+from upright import paths, plotting, registry, replay, simulate, trials
 
 USUAL = (10.0, 0.05)  # Q, R in deg**2: the values that are widely copied
 # half decades about them
@@ -112,8 +112,8 @@ def signal(
         x, y, z = trial.counts[:n, :3].astype(float).T
         angle = np.arctan2(y, z) if axis == "roll" else np.arctan2(-x, np.hypot(y, z))
         angle = np.degrees(angle)
-    elif source not in score.filter_names():
-        names = ", ".join([ACCELEROMETER, *score.filter_names()])
+    elif source not in registry.filters():
+        names = ", ".join([ACCELEROMETER, *registry.filters()])
         raise TuneError(f"unknown source {source!r}; there are {names}")
     else:
         done = replay.replay(

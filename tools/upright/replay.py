@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from upright import paths, rp2040, runtimes, scoring, simulate, trials
+from upright import paths, registry, rp2040, runtimes, scoring, simulate, trials
 
 # of a trial on rp2040 when nobody asks for more: each takes ten or more of this machine's
 BOARD_SECONDS = 2
@@ -43,6 +43,7 @@ def replay(
     on_progress  called with (rows done, rows in all) now and then
     Raises simulate.SimulationError, runtimes.Unavailable, and ValueError for what a runtime cannot do.
     """
+    registry.check(filter_name)
     if runtime == "rp2040":
         if direct:
             raise ValueError("on rp2040 the counts come through the chip's registers, not straight")

@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from upright import baselines, paths, plotting, replay, runtimes, scoring, simulate, trials
+from upright import baselines, plotting, registry, replay, runtimes, scoring, simulate, trials
 
 FILTERS = "mahony6,mahony9,inertial6,inertial9,inertial9-lite"
 COLUMNS = (
@@ -190,7 +190,7 @@ def wanted(filters: list[str], with_baselines: bool, notes: list) -> list[str]:
     """The names of filters and baselines, each once; what is not installed goes into notes. Raises ScoreError."""
     if not filters:
         raise ScoreError("no filter to score")
-    known = [*filter_names(), *baselines.BASELINES]
+    known = [*registry.filters(), *baselines.BASELINES]
     for name in filters:
         if name not in known:
             raise ScoreError(f"unknown filter {name!r}; there are {', '.join(known)}")
@@ -245,19 +245,6 @@ def replay_all(
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-
-
-def filter_names(of: str = "FILTERS") -> list[str]:
-    """The filters that the firmware knows; of="HARDWARE": those that a sensor computes by itself."""
-    done = subprocess.run(
-        [sys.executable, "-c", f"import filters; print(*filters.{of})"],
-        cwd=paths.FIRMWARE,
-        capture_output=True,
-        text=True,
-    )
-    if done.returncode:
-        raise ScoreError(f"firmware/filters.py: {done.stderr.strip()}")
-    return done.stdout.split()
 
 
 def _obtainable(names, notes: list) -> list[str]:
