@@ -149,7 +149,7 @@ def describe(data: bytes, expected: str | None = None) -> list[str]:
     if expected is None and image.sha256 not in KNOWN:
         raise ImageError(
             f"{image.size} bytes, as {image.version} has, but the SHA-256 {image.sha256} is not known; "
-            "if you trust the file, name that to the driver (known=) and here (--sha256)"
+            "if you trust the file, say --sha256 with it here, and DMP_SHA256 in board.py"
         )
     last = image.image_size - 1
     patches = sum(len(piece) for _, piece in image.patches())
