@@ -1,12 +1,12 @@
 # The Euler-angle method with a fixed step in 32-bit integers: roll, pitch and yaw from the gyro, roll and pitch drawn
-# to what the accelerometer shows. Needs fixmath.py, euler_kernels.py and the viper emitter. update() is made for a
-# hard interrupt: it allocates nothing, raises nothing, uses no float, and gives the same bits on every port.
+# to what the accelerometer shows. Needs attitude.py, fixmath.py, euler_kernels.py and the viper emitter. update() is
+# made for a hard interrupt: it allocates nothing, raises nothing, uses no float, and gives the same bits on every port.
 
-import math
 from array import array
 
 import fixmath
 import micropython
+from attitude import Attitude, bias_of, hertz
 from euler_kernels import compose, direction, lean, sines
 from micropython import const
 
@@ -34,13 +34,12 @@ _O = const(40)  # 3: what is added to the gyro: less the bias, set and learnt
 _OR = const(43)  # 3: its last 15 bits, -65534..0
 OWN = const(46)  # a subclass' words follow
 
-_BIAS_MAX = const(8192 * 256)  # 1/256 counts: 62 deg/s at +-250, 500 deg/s at +-2000 deg/s
 _STEP_MAX = const((1 << 30) // 6)  # no axis turns by more than 60 deg in a step
 _LEAST_MANTISSA = const(64)  # a gain is held to better than 1 %
 _POLE_SHIFT = const(5)  # 1/cos(pitch) is 32 at most: within 1.8 deg of the pole yaw turns no faster
 
 
-class Euler6:
+class Euler6(Attitude):
     """Attitude as three Euler angles (zyx), the way most people write their first filter.
 
     The gyro turns the angles by the kinematics of the order z, y, x, with u = q sin(roll) + r cos(roll):
@@ -76,7 +75,6 @@ class Euler6:
 
     NAME = "euler6"
     AXES = 6
-    QUATERNION = _Q  # where w x y z (Q29) stand in `state`
 
     _size = OWN  # words of the state
 
@@ -87,20 +85,11 @@ class Euler6:
 
     def _set_up(self, rate, gyro_scale, accel_lsb_per_g, bias_limit_dps=0):
         """All but the gains. Room is left for a bias that is learnt, up to the limit -> that in 2**-45 turn a step."""
-        self.rate = _ratio_of(rate, "rate", "Hz")
-        self.gyro_scale = _ratio_of(gyro_scale, "gyro_scale", "LSB per deg/s")
-        if not isinstance(accel_lsb_per_g, int) or not 64 <= accel_lsb_per_g <= 32767:
-            raise ValueError(
-                "accel_lsb_per_g is %r, expected an int, 64..32767" % (accel_lsb_per_g,)
-            )
-        self.accel_lsb_per_g = accel_lsb_per_g
         limit = fixmath.quantise(bias_limit_dps, "bias_limit_dps")
         if limit > 250000000:
             raise ValueError("bias_limit_dps is %r, expected 0..250 deg/s" % (bias_limit_dps,))
-        self.state = self._s = s = array("i", [0] * self._size)
-        self._q = memoryview(s)[_Q : _Q + 4]
+        s = self._begin(rate, gyro_scale, accel_lsb_per_g, self._size)
         self._bias = array("i", [0, 0, 0])  # 1/256 counts
-        s[_PROBE] = -1
         s[_LOW] = accel_lsb_per_g * accel_lsb_per_g >> 10  # (1/16 g)**2 / 4
         num, den = self.rate
         scale_num, scale_den = self.gyro_scale
@@ -112,7 +101,7 @@ class Euler6:
                 "rate is %s, expected %d..%d Hz at %d/%d LSB per deg/s and a bias limit of %r deg/s: "
                 "choose another rate or gyro range"
                 % (
-                    self._hz(),
+                    hertz(self.rate),
                     -(-least * num // (den * _STEP_MAX)),
                     (gain * num // den) >> 16,
                     scale_num,
@@ -125,10 +114,6 @@ class Euler6:
         self._place(0, 0, 0)
         return limit
 
-    def _hz(self):
-        num, den = self.rate
-        return "%d Hz" % num if den == 1 else "%d/%d Hz" % (num, den)
-
     def _set_tau(self, tau):
         num, den = self.rate
         millionths = fixmath.quantise(tau, "tau")
@@ -138,7 +123,13 @@ class Euler6:
             high = (den * 1000000 << 30) // (num * _LEAST_MANTISSA)
             raise ValueError(
                 "tau is %r, expected None or %d.%06d..%d s at a rate of %s"
-                % (tau, low // 1000000, low % 1000000, min(high // 1000000, 999999999), self._hz())
+                % (
+                    tau,
+                    low // 1000000,
+                    low % 1000000,
+                    min(high // 1000000, 999999999),
+                    hertz(self.rate),
+                )
             )
         self._s[_K] = pair[0]
         self._s[_K_SHIFT] = pair[1] - 14
@@ -191,12 +182,7 @@ class Euler6:
 
         Raises ValueError beyond +-8192 counts.
         """
-        bias = (x, y, z)
-        for b in bias:
-            if not isinstance(b, int) or not -_BIAS_MAX <= b <= _BIAS_MAX:
-                raise ValueError(
-                    "bias is %r, expected ints in 1/256 count, at most +-%d" % (bias, _BIAS_MAX)
-                )
+        bias = bias_of(x, y, z)
         s = self._s
         gain = (s[_G] << 15) + s[_GR]
         for i in range(3):
@@ -218,22 +204,7 @@ class Euler6:
         for i in range(3):
             out[i] = fixmath.ratio(self._bias[i] * 1000 * den, 256 * num)
 
-    def quaternion_floats(self):
-        """The attitude as 4 floats (w, x, y, z) of unit length, for hosts."""
-        q = self._q
-        w, x, y, z = q[0], q[1], q[2], q[3]
-        norm = math.sqrt(w * w + x * x + y * y + z * z)
-        return w / norm, x / norm, y / norm, z / norm
-
     # -- tick
-    def quaternion(self, out):
-        """Copy the attitude to out[0..3], an array('i'): w x y z in Q29, body to earth."""
-        q = self._q
-        out[0] = q[0]
-        out[1] = q[1]
-        out[2] = q[2]
-        out[3] = q[3]
-
     def angles(self, out, order="zyx"):
         """Roll, pitch, yaw of the attitude in integer millidegrees: see fixmath.euler.
 
@@ -392,16 +363,6 @@ def step(state, counts) -> int:
 
 
 # ----------------------------------------------------------------------------- set-up: allocates
-def _ratio_of(value, name, unit_name):
-    num, den = value if isinstance(value, (tuple, list)) else (value, 1)
-    if not isinstance(num, int) or not isinstance(den, int) or num <= 0 or den <= 0:
-        raise ValueError(
-            "%s is %r, expected a positive int or a pair (num, den) of them, in %s"
-            % (name, value, unit_name)
-        )
-    return num, den
-
-
 def _direction(y, x):
     """euler_kernels.direction of ints of any size."""
     most = max(abs(y), abs(x))

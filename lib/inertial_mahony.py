@@ -1,13 +1,12 @@
 # The inertial-frame Mahony filter in 32-bit integers: sensor counts in, quaternion out, with its own gyro bias and its
-# own judgement of the magnetic field. Needs fixmath.py, inertial_kernels.py and the viper emitter. update() is made for
-# a hard interrupt: it allocates nothing, raises nothing, uses no float, and gives the same bits on every port.
-
-import math
-from array import array
+# own judgement of the magnetic field. Needs attitude.py, fixmath.py, inertial_kernels.py and the viper emitter.
+# update() is made for a hard interrupt: it allocates nothing, raises nothing, uses no float, and gives the same bits on
+# every port.
 
 import fixmath
 import inertial_kernels
 import micropython
+from attitude import Attitude, bias_of, hertz
 from fixmath import turn
 from inertial_kernels import (
     compass,
@@ -117,12 +116,11 @@ _NINE = const(178)
 _GAP = const(180)
 _OUTAGE = const(181)
 
-_BIAS_MAX = const(8192 * 256)  # 1/256 counts: 62 deg/s at +-250, 500 deg/s at +-2000 deg/s
 _W_MAX = const((1 << 31) - (1 << 16))  # 1 rad in Q31, less what fixmath.turn adds for rounding
 _MILLION = const(1000000)
 
 
-class InertialMahony:
+class InertialMahony(Attitude):
     """Attitude from gyro, accelerometer and magnetometer: Mahony's filter with its error averaged in the earth frame.
 
     After R. Mahony, T. Hamel, J.-M. Pflimlin, IEEE TAC 53(5), 2008, with the acceleration low-passed in the earth
@@ -174,23 +172,13 @@ class InertialMahony:
 
     NAME = "inertial9"
     AXES = 9
-    QUATERNION = _Q  # where w x y z (Q29) stand in `state`
 
     def __init__(self, rate, gyro_scale, accel_lsb_per_g, axes=9, lite=False, **parameters):
-        self.rate = _ratio_of(rate, "rate", "Hz")
-        self.gyro_scale = _ratio_of(gyro_scale, "gyro_scale", "LSB per deg/s")
-        if not isinstance(accel_lsb_per_g, int) or not 64 <= accel_lsb_per_g <= 32767:
-            raise ValueError(
-                "accel_lsb_per_g is %r, expected an int, 64..32767" % (accel_lsb_per_g,)
-            )
         if axes not in (6, 9):
             raise ValueError("axes is %r, expected 6 or 9" % (axes,))
-        self.accel_lsb_per_g = accel_lsb_per_g
         self.AXES = axes
         self.NAME = "inertial%d" % axes + ("-lite" if lite else "")
-        self.state = self._s = s = array("i", [0] * inertial_kernels.WORDS)
-        self._q = memoryview(s)[_Q : _Q + 4]
-        s[_PROBE] = -1
+        s = self._begin(rate, gyro_scale, accel_lsb_per_g, inertial_kernels.WORDS)
         s[_NINE] = int(axes == 9)
         s[_LITE] = int(bool(lite))
         _set_up(s, self.rate, self.gyro_scale, accel_lsb_per_g, parameters)
@@ -220,14 +208,6 @@ class InertialMahony:
             self._attitude(fixmath.level(x, y, z))
         return True
 
-    def set_quaternion(self, w, x, y, z):
-        """Set the attitude outright: any 4 ints or floats; they need not be normalised.
-
-        The filter then starts anew: it follows accelerometer and magnetometer quickly for the first seconds.
-        Raises ValueError when all are 0 or one is not finite.
-        """
-        self._attitude(fixmath.unit_quaternion(w, x, y, z))
-
     def _attitude(self, q):
         s = self._s
         for i in range(4):
@@ -249,12 +229,7 @@ class InertialMahony:
 
         Raises ValueError beyond +-8192 counts.
         """
-        bias = (x, y, z)
-        for b in bias:
-            if not isinstance(b, int) or not -_BIAS_MAX <= b <= _BIAS_MAX:
-                raise ValueError(
-                    "bias is %r, expected ints in 1/256 count, at most +-%d" % (bias, _BIAS_MAX)
-                )
+        bias = bias_of(x, y, z)
         s = self._s
         gain = (s[_G] << 15) + s[_GR]
         for i in range(3):
@@ -284,13 +259,6 @@ class InertialMahony:
             b = (s[_BASE + i] << (shift - 8)) + s[_B + i]
             out[i] = fixmath.ratio(b * 1000 * den, num << shift)
 
-    def quaternion_floats(self):
-        """The attitude as 4 floats (w, x, y, z) of unit length, for hosts."""
-        q = self._q
-        w, x, y, z = q[0], q[1], q[2], q[3]
-        norm = math.sqrt(w * w + x * x + y * y + z * z)
-        return w / norm, x / norm, y / norm, z / norm
-
     @property
     def resting(self):
         """True while the body is taken to be at rest: then the bias is what the gyro reads."""
@@ -317,21 +285,6 @@ class InertialMahony:
         return self._s[_OM] * 125 >> 12
 
     # -- tick
-    def quaternion(self, out):
-        """Copy the attitude to out[0..3], an array('i'): w x y z in Q29, body to earth."""
-        q = self._q
-        out[0] = q[0]
-        out[1] = q[1]
-        out[2] = q[2]
-        out[3] = q[3]
-
-    def angles(self, out, order="zyx"):
-        """Roll, pitch, yaw of the attitude in integer millidegrees: see fixmath.euler.
-
-        Where a tick may cut in, convert a copy of the quaternion: fixmath.euler(copy, out, order).
-        """
-        fixmath.euler(self._q, out, order)
-
     @micropython.viper
     def update(self, counts):
         """One step of 1/rate with the sample counts: array('h') of 11 words.
@@ -428,12 +381,16 @@ class Inertial6(InertialMahony):
     NAME = "inertial6"
     AXES = 6
 
+    update = InertialMahony.update  # see attitude.py
+
     def __init__(self, rate, gyro_scale, accel_lsb_per_g, **parameters):
         InertialMahony.__init__(self, rate, gyro_scale, accel_lsb_per_g, 6, False, **parameters)
 
 
 class Inertial9(InertialMahony):
     """InertialMahony with everything."""
+
+    update = InertialMahony.update  # see attitude.py
 
     def __init__(self, rate, gyro_scale, accel_lsb_per_g, **parameters):
         InertialMahony.__init__(self, rate, gyro_scale, accel_lsb_per_g, 9, False, **parameters)
@@ -443,6 +400,8 @@ class Inertial9Lite(InertialMahony):
     """InertialMahony that takes every magnetic field as it is."""
 
     NAME = "inertial9-lite"
+
+    update = InertialMahony.update  # see attitude.py
 
     def __init__(self, rate, gyro_scale, accel_lsb_per_g, **parameters):
         InertialMahony.__init__(self, rate, gyro_scale, accel_lsb_per_g, 9, True, **parameters)
@@ -475,16 +434,6 @@ PARAMETERS = {
     "restart_after": (5, 0.5, 100),
     "outage": (0.5, 0.05, 10),
 }
-
-
-def _ratio_of(value, name, unit_name):
-    num, den = value if isinstance(value, (tuple, list)) else (value, 1)
-    if not isinstance(num, int) or not isinstance(den, int) or num <= 0 or den <= 0:
-        raise ValueError(
-            "%s is %r, expected a positive int or a pair (num, den) of them, in %s"
-            % (name, value, unit_name)
-        )
-    return num, den
 
 
 def _mantissa(num, den, bits):
@@ -523,7 +472,7 @@ def _set_up(s, rate, gyro_scale, lsb, parameters):
     num, den = rate
     scale, per = gyro_scale
     shift = _block_of(num, den)
-    text = "%d Hz" % num if den == 1 else "%d/%d Hz" % rate
+    text = hertz(rate)
     if shift > 5 or num < 50 * den:
         raise ValueError("rate is %s, expected 50..1439 Hz" % text)
     blocks, t = num, den << shift  # blocks a second: blocks / t

@@ -1,11 +1,12 @@
 # Kalman filters with steady gains in 32-bit integers: one for any angle or number, and one for attitude that learns the
-# gyro's bias. Needs fixmath.py, complementary.py, euler_kernels.py and the viper emitter. update() is made for a hard
-# interrupt: it allocates nothing, raises nothing, uses no float, and gives the same bits on every port.
+# gyro's bias. Needs attitude.py, fixmath.py, complementary.py, euler_kernels.py and the viper emitter. update() is made
+# for a hard interrupt: it allocates nothing, raises nothing, uses no float, and gives the same bits on every port.
 
 from array import array
 
 import fixmath
 import micropython
+from attitude import hertz
 from complementary import Euler6, step
 from micropython import const
 
@@ -257,7 +258,7 @@ class Kalman6(Euler6):
                     r_angle,
                     k1 / ONE,
                     k2 / ONE,
-                    self._hz(),
+                    hertz(self.rate),
                     64 / (1 << (43 + shift)),
                     16383 / (1 << (15 + shift)),
                 )

@@ -1,14 +1,14 @@
 # Mahony's attitude filter with a fixed step in 32-bit integers, for six and for nine axes: sensor
 # counts in, quaternion out.
-# Needs fixmath.py and the viper emitter. update() is made for a hard interrupt: it allocates
+# Needs attitude.py, fixmath.py and the viper emitter. update() is made for a hard interrupt: it allocates
 # nothing, raises nothing, uses no float, and gives the same bits on every port. docs/numerics.md
 # has the bounds.
 
-import math
 from array import array
 
 import fixmath
 import micropython
+from attitude import Attitude, bias_of, hertz
 from fixmath import north, tilt, turn
 from micropython import const
 
@@ -39,7 +39,6 @@ _MAG_MOST = const(52)  # a magnetometer sample stands for at most so many steps,
 _MAG_AGE = const(53)  # steps since one was used, 0.._NEVER
 _WORDS = const(54)
 
-_BIAS_MAX = const(8192 * 256)  # 1/256 counts: 62 deg/s at +-250, 500 deg/s at +-2000 deg/s
 _W_MAX = const((1 << 31) - (1 << 16))  # 1 rad in Q31, less what fixmath.turn adds for rounding
 _LEAST_MANTISSA = const(64)  # a gain is held to better than 1 %
 _NEVER = const(0x3FFFFFFF)
@@ -47,7 +46,7 @@ _MAG_LEAST_HZ = const(10)  # a slower magnetometer acts with less than its full 
 _SEED_SINE = const(32)  # no heading from a field within asin(1/32), 1.8 deg, of the vertical
 
 
-class Mahony6:
+class Mahony6(Attitude):
     """Attitude from gyro and accelerometer: Mahony's explicit complementary filter with PI feedback.
 
     R. Mahony, T. Hamel, J.-M. Pflimlin, Nonlinear Complementary Filters on the Special Orthogonal
@@ -77,20 +76,10 @@ class Mahony6:
 
     NAME = "mahony6"
     AXES = 6
-    QUATERNION = _Q  # where w x y z (Q29) stand in `state`
 
     def __init__(self, rate, gyro_scale, accel_lsb_per_g, kp=0.5, ki=0.0, bias_limit_dps=20):
-        self.rate = _ratio_of(rate, "rate", "Hz")
-        self.gyro_scale = _ratio_of(gyro_scale, "gyro_scale", "LSB per deg/s")
-        if not isinstance(accel_lsb_per_g, int) or not 64 <= accel_lsb_per_g <= 32767:
-            raise ValueError(
-                "accel_lsb_per_g is %r, expected an int, 64..32767" % (accel_lsb_per_g,)
-            )
-        self.accel_lsb_per_g = accel_lsb_per_g
-        self.state = self._s = s = array("i", [0] * _WORDS)
-        self._q = memoryview(s)[_Q : _Q + 4]
+        s = self._begin(rate, gyro_scale, accel_lsb_per_g, _WORDS)
         self._bias = array("i", [0, 0, 0])  # 1/256 counts
-        s[_PROBE] = -1
         s[_Q] = fixmath.ONE
         s[_LOW] = accel_lsb_per_g * accel_lsb_per_g >> 10  # (1/16 g)**2 / 4
         s[_MAG_AGE] = _NEVER
@@ -111,13 +100,6 @@ class Mahony6:
         self._attitude(fixmath.level(x, y, z))
         return True
 
-    def set_quaternion(self, w, x, y, z):
-        """Set the attitude outright: any 4 ints or floats; they need not be normalised.
-
-        Raises ValueError when all are 0 or one is not finite.
-        """
-        self._attitude(fixmath.unit_quaternion(w, x, y, z))
-
     def _attitude(self, q):
         for i in range(4):
             self._s[_Q + i] = q[i]
@@ -131,12 +113,7 @@ class Mahony6:
         The integral of the feedback is kept apart from it (it is added to the rate) and starts
         again from 0. Raises ValueError beyond +-8192 counts.
         """
-        bias = (x, y, z)
-        for b in bias:
-            if not isinstance(b, int) or not -_BIAS_MAX <= b <= _BIAS_MAX:
-                raise ValueError(
-                    "bias is %r, expected ints in 1/256 count, at most +-%d" % (bias, _BIAS_MAX)
-                )
+        bias = bias_of(x, y, z)
         s = self._s
         gain = (s[_G] << 15) + s[_GR]
         for i in range(3):
@@ -176,29 +153,7 @@ class Mahony6:
                 den * fixmath.PI_NUM << (31 + s[_I_SHIFT]),
             )
 
-    def quaternion_floats(self):
-        """The attitude as 4 floats (w, x, y, z) of unit length, for hosts."""
-        q = self._q
-        w, x, y, z = q[0], q[1], q[2], q[3]
-        norm = math.sqrt(w * w + x * x + y * y + z * z)
-        return w / norm, x / norm, y / norm, z / norm
-
     # -- tick
-    def quaternion(self, out):
-        """Copy the attitude to out[0..3], an array('i'): w x y z in Q29, body to earth."""
-        q = self._q
-        out[0] = q[0]
-        out[1] = q[1]
-        out[2] = q[2]
-        out[3] = q[3]
-
-    def angles(self, out, order="zyx"):
-        """Roll, pitch, yaw of the attitude in integer millidegrees: see fixmath.euler.
-
-        Where a tick may cut in, convert a copy of the quaternion: fixmath.euler(copy, out, order).
-        """
-        fixmath.euler(self._q, out, order)
-
     @micropython.viper
     def update(self, counts):
         """One step of 1/rate with the sample counts: array('h') of 11 words.
@@ -309,7 +264,7 @@ class Mahony9(Mahony6):
     AXES = 9
 
     heading_seeded = False
-    update = Mahony6.update  # found at once: a look-up in the class above costs 400 instructions
+    update = Mahony6.update  # see attitude.py
 
     def seed(self, counts):
         """Mahony6.seed, with the heading from the magnetometer when flags (word 10) has bit 1 set.
@@ -340,16 +295,6 @@ class Mahony9(Mahony6):
 
 
 # ----------------------------------------------------------------------------- set-up: allocates
-def _ratio_of(value, name, unit_name):
-    num, den = value if isinstance(value, (tuple, list)) else (value, 1)
-    if not isinstance(num, int) or not isinstance(den, int) or num <= 0 or den <= 0:
-        raise ValueError(
-            "%s is %r, expected a positive int or a pair (num, den) of them, in %s"
-            % (name, value, unit_name)
-        )
-    return num, den
-
-
 def _set_gains(s, rate, gyro_scale, kp, ki, bias_limit_dps, error_max=1):
     """Turn rate, scales and gains into the state's words, in integers throughout.
 
@@ -360,7 +305,7 @@ def _set_gains(s, rate, gyro_scale, kp, ki, bias_limit_dps, error_max=1):
     1.
     """
     num, den = rate
-    text = "%d Hz" % num if den == 1 else "%d/%d Hz" % rate
+    text = hertz(rate)
     # half angle per step of 1 deg/s: half_num / half_den rad
     half_num = fixmath.PI_NUM * den
     half_den = fixmath.PI_DEN * 360 * num

@@ -2,10 +2,8 @@
 # quaternion, accelerometer and gyro from its packets. Needs a driver (mpu6050.py, mpu6500.py) and fixmath.py. The
 # image is InvenSense's and not part of this library. Runs on MicroPython >= 1.22 and, with a stand-in, on CPython.
 
-import math
 import time
 
-import fixmath
 import micropython
 from micropython import const
 from mpu_common import HEALTH_OK
@@ -156,7 +154,6 @@ class MpuDmp(MpuDmpSetup):
 
     NAME = "dmp6"
     AXES = 6
-    QUATERNION = _Q  # where w x y z (Q29) stand in `state`
     error_class = MpuDmpError
 
     # -- the tick: nothing below allocates, waits, raises or uses a float
@@ -266,21 +263,9 @@ class MpuDmp(MpuDmpSetup):
     def update(self, counts):
         """Nothing to do: read() has brought the attitude with the sample."""
 
-    def quaternion(self, out):
-        """Copy the attitude to out[0..3], an array('i'): w x y z in Q29, body to earth."""
-        q = self._q
-        out[0] = q[0]
-        out[1] = q[1]
-        out[2] = q[2]
-        out[3] = q[3]
-
     def q30(self, out):
         """Copy the quaternion as the packet has it to out[0..3], an array('i'): w x y z in Q30, chip to earth."""
         _copy(self._s, _Q30, out)
-
-    def angles(self, out, order="zyx"):
-        """Roll, pitch, yaw of the attitude in integer millidegrees: see fixmath.euler."""
-        fixmath.euler(self._q, out, order)
 
     def seed(self, counts):
         """False: the DMP finds its attitude by itself."""
@@ -301,13 +286,6 @@ class MpuDmp(MpuDmpSetup):
             out[i] = 0
 
     bias_mdps = bias
-
-    def quaternion_floats(self):
-        """The attitude as 4 floats (w, x, y, z) of unit length, for hosts."""
-        q = self._q
-        w, x, y, z = q[0], q[1], q[2], q[3]
-        norm = math.sqrt(w * w + x * x + y * y + z * z)
-        return w / norm, x / norm, y / norm, z / norm
 
     # -- what the driver knows
 

@@ -7,6 +7,7 @@ import time
 from array import array
 
 import fixmath
+from attitude import Attitude
 from micropython import const
 from mpu_dmp_image import DIVIDER, KNOWN, DmpImage, MpuDmpError
 
@@ -40,7 +41,7 @@ _T = const(14)  # 4 x 4, Q15: from the packet's quaternion to the body's
 _STATE_WORDS = const(30)
 
 
-class MpuDmpSetup:
+class MpuDmpSetup(Attitude):
     """What may wait, allocate and raise; mpu_dmp.MpuDmp adds what the tick calls."""
 
     def __init__(

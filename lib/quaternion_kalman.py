@@ -1,14 +1,12 @@
 # The multiplicative quaternion Kalman filter in 32-bit integers: sensor counts in, quaternion out, with the gyro's bias
-# and with variances that say how well all of it is known. Needs fixmath.py, quaternion_kernels.py and the viper
-# emitter. update() is made for a hard interrupt: it allocates nothing, raises nothing, uses no float, and gives the
-# same bits on every port.
-
-import math
-from array import array
+# and with variances that say how well all of it is known. Needs attitude.py, fixmath.py, quaternion_kernels.py and the
+# viper emitter. update() is made for a hard interrupt: it allocates nothing, raises nothing, uses no float, and gives
+# the same bits on every port.
 
 import fixmath
 import micropython
 import quaternion_kernels
+from attitude import Attitude, bias_of, hertz
 from fixmath import turn
 from micropython import const
 from quaternion_kernels import (
@@ -116,7 +114,6 @@ _WIDE = const(8)
 _RUNAWAY = const(16)
 _UPSET = const(128)
 _NOT_BY_MAG = const(0xC3)  # tilt and velocity
-_BIAS_MAX = const(8192 * 256)  # 1/256 counts: 62 deg/s at +-250, 500 deg/s at +-2000 deg/s
 _W_MAX = const((1 << 31) - (1 << 16))  # 1 rad in Q31, less what fixmath.turn adds for rounding
 _FOLD_W = const(651000000)  # half of sqrt(3) 0.35 rad, Q31
 _TILT_START = const(2943809)  # (3 deg)**2, Q30
@@ -202,7 +199,7 @@ def work(state, n: int):
                 open_up(state, 7, s[_V0])
 
 
-class QuaternionKalman:
+class QuaternionKalman(Attitude):
     """Attitude and gyro bias from gyro, accelerometer and magnetometer: an error-state Kalman filter of 8 states.
 
     The attitude is the quaternion, turned by every gyro sample; the filter estimates its error as a small rotation
@@ -256,27 +253,17 @@ class QuaternionKalman:
 
     NAME = "quaternion-kalman9"
     AXES = 9
-    QUATERNION = _Q  # where w x y z (Q29) stand in `state`
 
     def __init__(self, rate, gyro_scale, accel_lsb_per_g, axes=9, **parameters):
-        self.rate = _ratio_of(rate, "rate", "Hz")
-        self.gyro_scale = _ratio_of(gyro_scale, "gyro_scale", "LSB per deg/s")
-        if not isinstance(accel_lsb_per_g, int) or not 64 <= accel_lsb_per_g <= 32767:
-            raise ValueError(
-                "accel_lsb_per_g is %r, expected an int, 64..32767" % (accel_lsb_per_g,)
-            )
         if axes not in (6, 9):
             raise ValueError("axes is %r, expected 6 or 9" % (axes,))
-        self.accel_lsb_per_g = accel_lsb_per_g
         self.AXES = axes
         self.NAME = "quaternion-kalman%d" % axes
-        self.state = self._s = s = array("i", [0] * quaternion_kernels.WORDS)
-        self._q = memoryview(s)[_Q : _Q + 4]
-        s[_PROBE] = -1
+        s = self._begin(rate, gyro_scale, accel_lsb_per_g, quaternion_kernels.WORDS)
         s[_NINE] = int(axes == 9)
         _set_up(s, self.rate, self.gyro_scale, accel_lsb_per_g, parameters)
         self.set_bias(0, 0, 0)
-        self._attitude((fixmath.ONE, 0, 0, 0), _OPEN)
+        self._attitude((fixmath.ONE, 0, 0, 0))
 
     # -- set-up and main loop
     def seed(self, counts):
@@ -288,7 +275,7 @@ class QuaternionKalman:
         """
         x, y, z = counts[0], counts[1], counts[2]
         if (x * x + y * y + z * z) << 8 < self.accel_lsb_per_g**2:
-            self._attitude((fixmath.ONE, 0, 0, 0), _OPEN)
+            self._attitude((fixmath.ONE, 0, 0, 0))
             return False
         i, j, k = counts[6], counts[7], counts[8]
         heading = _HEADING_START
@@ -305,15 +292,7 @@ class QuaternionKalman:
         self._open(2, heading if self.AXES == 9 else _HEADING_START)
         return True
 
-    def set_quaternion(self, w, x, y, z):
-        """Set the attitude outright: any 4 ints or floats; they need not be normalised.
-
-        It is taken for a guess: accelerometer and magnetometer correct it within the first half second.
-        Raises ValueError when all are 0 or one is not finite.
-        """
-        self._attitude(fixmath.unit_quaternion(w, x, y, z), _OPEN)
-
-    def _attitude(self, q, variance):
+    def _attitude(self, q, variance=_OPEN):
         s = self._s
         for i in range(4):
             s[_Q + i] = q[i]
@@ -343,12 +322,7 @@ class QuaternionKalman:
 
         Raises ValueError beyond +-8192 counts.
         """
-        bias = (x, y, z)
-        for b in bias:
-            if not isinstance(b, int) or not -_BIAS_MAX <= b <= _BIAS_MAX:
-                raise ValueError(
-                    "bias is %r, expected ints in 1/256 count, at most +-%d" % (bias, _BIAS_MAX)
-                )
+        bias = bias_of(x, y, z)
         s = self._s
         step = (s[_G] << 15) + s[_GR]
         for i in range(3):
@@ -384,13 +358,6 @@ class QuaternionKalman:
         unit = 1 << (self._s[_C] + 25 + self._s[_BLOCK])
         return 180 * fixmath.PI_DEN * num * scale, unit * fixmath.PI_NUM * den * per
 
-    def quaternion_floats(self):
-        """The attitude as 4 floats (w, x, y, z) of unit length, for hosts."""
-        q = self._q
-        w, x, y, z = q[0], q[1], q[2], q[3]
-        norm = math.sqrt(w * w + x * x + y * y + z * z)
-        return w / norm, x / norm, y / norm, z / norm
-
     @property
     def resting(self):
         """True while the body is taken to be at rest: then the gyro measures its own bias."""
@@ -416,21 +383,6 @@ class QuaternionKalman:
         return _mdeg(self._s[_P + 15])
 
     # -- tick
-    def quaternion(self, out):
-        """Copy the attitude to out[0..3], an array('i'): w x y z in Q29, body to earth."""
-        q = self._q
-        out[0] = q[0]
-        out[1] = q[1]
-        out[2] = q[2]
-        out[3] = q[3]
-
-    def angles(self, out, order="zyx"):
-        """Roll, pitch, yaw of the attitude in integer millidegrees: see fixmath.euler.
-
-        Where a tick may cut in, convert a copy of the quaternion: fixmath.euler(copy, out, order).
-        """
-        fixmath.euler(self._q, out, order)
-
     @micropython.viper
     def update(self, counts):
         """One step of 1/rate with the sample counts: array('h') of 11 words.
@@ -507,9 +459,7 @@ class QuaternionKalman6(QuaternionKalman):
     NAME = "quaternion-kalman6"
     AXES = 6
 
-    update = (
-        QuaternionKalman.update
-    )  # found at once: a look-up in the class above costs 400 instructions
+    update = QuaternionKalman.update  # see attitude.py
 
     def __init__(self, rate, gyro_scale, accel_lsb_per_g, **parameters):
         QuaternionKalman.__init__(self, rate, gyro_scale, accel_lsb_per_g, 6, **parameters)
@@ -518,7 +468,7 @@ class QuaternionKalman6(QuaternionKalman):
 class QuaternionKalman9(QuaternionKalman):
     """QuaternionKalman with everything."""
 
-    update = QuaternionKalman.update
+    update = QuaternionKalman.update  # see attitude.py
 
     def __init__(self, rate, gyro_scale, accel_lsb_per_g, **parameters):
         QuaternionKalman.__init__(self, rate, gyro_scale, accel_lsb_per_g, 9, **parameters)
@@ -540,16 +490,6 @@ PARAMETERS = {
     "rest_after": (1.5, 0.2, 10),
     "field_tolerance": (0.2, 0.02, 0.7),
 }
-
-
-def _ratio_of(value, name, unit_name):
-    num, den = value if isinstance(value, (tuple, list)) else (value, 1)
-    if not isinstance(num, int) or not isinstance(den, int) or num <= 0 or den <= 0:
-        raise ValueError(
-            "%s is %r, expected a positive int or a pair (num, den) of them, in %s"
-            % (name, value, unit_name)
-        )
-    return num, den
 
 
 def _mdeg(variance):
@@ -593,7 +533,7 @@ def _set_up(s, rate, gyro_scale, lsb, parameters):
     num, den = rate
     scale, per = gyro_scale
     shift = _block_of(num, den)
-    text = "%d Hz" % num if den == 1 else "%d/%d Hz" % rate
+    text = hertz(rate)
     if shift > 5 or num < 50 * den:
         raise ValueError("rate is %s, expected 50..1439 Hz" % text)
     t = den << shift  # a block lasts t / num s

@@ -19,7 +19,15 @@ from upright import __version__, paths, runtimes
 _TOGETHER = {"mpu6500": ("ist8310",), "ist8310": ("mpu6500",), "mpu_dmp": ("mpu6050",)}
 # What serves other modules only
 _INNER = (
-    *("fixmath", "mpu_common", "mpu_parts", "mpu_setup", "mpu_selftest", "inertial_kernels"),
+    *(
+        "attitude",
+        "fixmath",
+        "mpu_common",
+        "mpu_parts",
+        "mpu_setup",
+        "mpu_selftest",
+        "inertial_kernels",
+    ),
     *("euler_kernels", "quaternion_kernels", "mpu_dmp_image", "mpu_dmp_setup"),
     *("ssd1306_canvas", "ssd1306_font"),
 )
