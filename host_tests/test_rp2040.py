@@ -333,6 +333,16 @@ def test_a_replay_on_the_board_writes_the_bytes_that_cpython_writes(image, tmp_p
     assert progress[-1] == (300, 300)
 
 
+@pytest.mark.parametrize("name", ["inertial6", "quaternion-kalman6"])
+def test_every_kind_of_filter_gives_cpython_s_bits_in_a_hard_interrupt(image, name):
+    import motions
+
+    trial = as_trial(motions.render("bursts", rate=(200, 1), seconds=0.4, seed=3))
+    there, here = replay.replay(trial, name, "rp2040"), replay.replay(trial, name)
+    assert np.array_equal(there.q29, here.q29)
+    assert len(np.unique(there.q29, axis=0)) > 60
+
+
 @pytest.mark.parametrize(
     ("options", "why"), [({"direct": True}, "registers"), ({"filter_name": "mahony9"}, "six axes")]
 )
