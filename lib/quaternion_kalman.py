@@ -55,6 +55,8 @@ _UR = const(164)
 _UM = const(165)
 _OVER = const(166)
 _MEANT = const(249)
+_YOUNG = const(251)
+_AFTER = const(252)
 _HG = const(168)
 _HG_SHIFT = const(169)
 _C = const(170)
@@ -114,10 +116,11 @@ _WIDE = const(8)
 _RUNAWAY = const(16)
 _UPSET = const(128)
 _NOT_BY_MAG = const(0xC3)  # tilt and velocity
+_BIAS = const(0x38)
 _W_MAX = const((1 << 31) - (1 << 16))  # 1 rad in Q31, less what fixmath.turn adds for rounding
 _FOLD_W = const(651000000)  # half of sqrt(3) 0.35 rad, Q31
-_TILT_START = const(2943809)  # (3 deg)**2, Q30
-_HEADING_START = const(8177247)  # (5 deg)**2
+_SEEDED = const(47099587)  # (12 deg)**2, Q30: of an attitude from one sample
+_HEADING_START = const(8177247)  # (5 deg)**2: of a heading that is relative
 _SIGMA = const(26000)  # first sigma of the bias in P's units, no more
 _MILLION = const(1000000)
 
@@ -138,6 +141,8 @@ def work(state, n: int):
         run(state)
         noise(state)
     elif n == 3:
+        if s[_YOUNG]:
+            s[_YOUNG] -= 1
         rest(state)
         if s[_DECIDED] & _UPSET:
             open_up(state, 0, _OPEN)
@@ -167,6 +172,8 @@ def work(state, n: int):
                     open_up(state, 2, _OPEN)
                 s[_UH] = 2
                 s[_UM] = _NOT_BY_MAG
+                if s[_YOUNG]:
+                    s[_UM] |= _BIAS
                 gain(state)
                 shrink(state)
     else:
@@ -174,6 +181,8 @@ def work(state, n: int):
             tilted(state)
         i = n - 4
         s[_UM] = 0
+        if s[_YOUNG]:
+            s[_UM] = _BIAS
         if s[_DECIDED] & _WIDE:
             s[_UH] = i
             s[_UE] = s[_MEANT + i]
@@ -234,7 +243,10 @@ class QuaternionKalman(Attitude):
                              (15 deg) that it is believed as it is, 0.02..1
     velocity_noise   1.1     m/s per root Hz, 0.1..2
     mag_noise        0.15    of the heading, rad per root Hz, 0.01..0.2
-    bias_start       3.3     first sigma of the bias (on top of set_bias), deg/s, 0.5..10
+    bias_start       3.3     first sigma of the bias (on top of set_bias), which is no larger than 2.5 of them, deg/s,
+                             0.5..10
+    bias_after       5       nothing but rest tells of the bias before this time, s, 0..60: a start in motion is a
+                             wrong start, and its corrections are not those of a bias
     rest_noise       0.03    of the averaged gyro at rest, deg/s per root Hz, 0.01..1
     rest_gyro_dps    2       at rest the gyro's mean of a block stays this near to its average, deg/s, 0.1..10
     rest_accel_g     0.05    and the accelerometer's this near to its own, g, 0.01..0.1
@@ -243,7 +255,7 @@ class QuaternionKalman(Attitude):
 
     Limits: a push that lasts (0.3 g for 5 s) is taken for a tilt; a kick that the gyro has not seen is forgotten at
     once at rest, but only within 15 s in motion; a steady rotation from power-on on looks like a bias and is taken for
-    one, up to 2.5 bias_start.
+    one.
 
     Raises ValueError for a rate, scale or parameter that the numbers cannot hold, with the range that they can:
     60 to 1439 Hz at +-2000 deg/s, from 50 Hz on at +-1000 deg/s and less.
@@ -278,7 +290,7 @@ class QuaternionKalman(Attitude):
             self._attitude((fixmath.ONE, 0, 0, 0))
             return False
         i, j, k = counts[6], counts[7], counts[8]
-        heading = _HEADING_START
+        heading = _SEEDED
         if (
             self.AXES == 9
             and counts[10] & 2
@@ -288,7 +300,7 @@ class QuaternionKalman(Attitude):
         else:
             q = fixmath.level(x, y, z)
             heading = _OPEN
-        self._attitude(q, _TILT_START)
+        self._attitude(q, _SEEDED)
         self._open(2, heading if self.AXES == 9 else _HEADING_START)
         return True
 
@@ -304,6 +316,7 @@ class QuaternionKalman(Attitude):
                 s[first + i] = 0
         for i in (_WIDE_FOR, _LOST, _SINCE, _J, _FAR):
             s[i] = 0
+        s[_YOUNG] = s[_AFTER]
         s[_STAGE] = 8  # the block that was being worked on is of the old attitude
         s[_PHASE] = 1
         self._open(0, variance)
@@ -484,6 +497,7 @@ PARAMETERS = {
     "velocity_noise": (1.1, 0.1, 2),
     "mag_noise": (0.15, 0.01, 0.2),
     "bias_start": (3.3, 0.5, 10),
+    "bias_after": (5, 0, 60),
     "rest_noise": (0.03, 0.01, 1),
     "rest_gyro_dps": (2, 0.1, 10),
     "rest_accel_g": (0.05, 0.01, 0.1),
@@ -590,7 +604,9 @@ def _set_up(s, rate, gyro_scale, lsb, parameters):
     s[_C] = c - 15
     s[_B_SHIFT] = c + shift - 20
     s[_BS] = squared(p["bias_start"] * rad, _MILLION * degrees, 2, 2 * c)
-    s[_B_MOST] = min((1 << 30) - 1, ratio(25 * rad * t << (c + 10), degrees * num))
+    most = p["bias_start"] * 5 * rad * t << (c + 9)  # 2.5 sigma
+    s[_B_MOST] = min((1 << 30) - 1, ratio(most, _MILLION * degrees * num))
+    s[_AFTER] = blocks(p["bias_after"])
     # noise of a block
     s[_QT] = squared(p["gyro_noise"] * rad, _MILLION * degrees, 1, 46)
     s[_QB] = squared(p["bias_walk"] * rad, _MILLION * degrees, 3, 2 * c + 12)

@@ -110,7 +110,9 @@ _GOOD = const(245)  # 1: the field is that of the reference; 2: there is no refe
 _FIRST = const(246)  # blocks after which there is one
 _NOISE = const(247)  # variance / 16 of the heading
 _TAU_0 = const(248)  # blocks of 0.2 s, Q10
-WORDS = const(251)
+_YOUNG = const(251)  # blocks until motion tells of the bias
+_AFTER = const(252)  # the same at the start
+WORDS = const(253)
 
 _STILL_BIT = const(1)
 _NEAR_BIT = const(2)

@@ -30,6 +30,7 @@ DEFAULTS = {
     "velocity_noise": 1.1,  # m/s per root Hz
     "mag_noise": 0.15,  # rad per root Hz
     "bias_start": 3.3,  # deg/s
+    "bias_after": 5.0,  # s
     "rest_noise": 0.03,  # deg/s per root Hz
     "rest_gyro_dps": 2.0,
     "rest_accel_g": 0.05,
@@ -37,7 +38,7 @@ DEFAULTS = {
     "field_tolerance": 0.2,
 }
 GRAVITY = 9.80665
-TILT_START, HEADING_START = math.radians(3), math.radians(5)
+SEEDED, HEADING_START = math.radians(12), math.radians(5)
 OPEN = 0.75  # rad: (0.75 rad)**2 is 603979776 in Q30
 VELOCITY_START = 0.05  # g s
 WIDE_VARIANCE = 0.0685  # rad**2, (15 deg)**2
@@ -45,7 +46,7 @@ LEAN_VARIANCE = 0.1225  # rad**2, (20 deg)**2
 WIDE_FOR = 0.4  # s
 CAP = 0.64  # rad**2
 FOLD = 0.35  # rad
-BIAS_MOST = math.radians(25)
+BIAS_MOST = 2.5  # of bias_start
 REST_TAU = 0.25  # s
 FIELD_SMOOTH = 0.05  # s
 FIELD_TAU, FIELD_TAU_FAR = 20.0, 100.0  # s
@@ -54,6 +55,7 @@ FIELD_DOUBT = 0.1
 FAR_RAD, FAR_FOR = 0.55, 5.0  # s
 LOST_FOR = 1.0  # s
 NOT_BY_MAG = np.array([1, 1, 0, 0, 0, 0, 1, 1], bool)
+BIAS = np.array([0, 0, 0, 1, 1, 1, 0, 0], bool)
 
 
 class QuaternionKalmanFloat:
@@ -119,9 +121,11 @@ class QuaternionKalmanFloat:
         self.phase = 1  # the first block is a whole one
         self.turn = None
         self.since, self.lost, self.lost_mag, self.wide_for = 0, 0, 0, 0
-        self.open(0, TILT_START**2 if seeded else OPEN**2)
-        self.open(1, TILT_START**2 if seeded else OPEN**2)
-        self.open(2, HEADING_START**2 if seeded is True or self.axes == 6 else OPEN**2)
+        self.young = int(self.p["bias_after"] / self.T + 0.5)
+        self.open(0, SEEDED**2 if seeded else OPEN**2)
+        self.open(1, SEEDED**2 if seeded else OPEN**2)
+        heading = SEEDED if seeded is True else OPEN
+        self.open(2, HEADING_START**2 if self.axes == 6 else heading**2)
         self.open(6, (VELOCITY_START / self.T) ** 2)
         self.open(7, (VELOCITY_START / self.T) ** 2)
 
@@ -191,7 +195,7 @@ class QuaternionKalmanFloat:
         x[7] -= x[0]
         self.fold = [clamp(v, FOLD) for v in x[0:3]]
         x[0:3] -= self.fold
-        most = BIAS_MOST * self.T
+        most = BIAS_MOST * self.p["bias_start"] * self.dps
         for i in range(3):
             self.b[i] = clamp(self.b[i] + x[3 + i], most)
         for i in range(2):
@@ -201,6 +205,7 @@ class QuaternionKalmanFloat:
 
     def _filter(self):
         self._propagate()
+        self.young = max(0, self.young - 1)
         rest = self._rest()
         self.unlevel = self.wide_for
         self._tilt()
@@ -237,6 +242,8 @@ class QuaternionKalmanFloat:
         left_out (mask): errors that this must not correct.
         """
         P = self.P
+        if self.young and i not in (3, 4, 5):
+            left_out = BIAS if left_out is None else BIAS | left_out
         s = P[i, i] + r
         k = P[:, i] / s
         e = z - self.x[i]
