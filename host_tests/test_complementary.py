@@ -443,23 +443,6 @@ def test_a_bias_is_subtracted_to_a_256th_of_a_count():
     assert degrees(filter)[2] == pytest.approx(expected, abs=1e-4)
 
 
-@pytest.mark.parametrize("b", [8192 * 256, -8192 * 256, 12345, -1, 0])
-def test_the_bias_reads_back(b):
-    filter = Euler6(200, SCALE, 4096)
-    filter.set_bias(b, -b, 5)
-    out = array("i", [0] * 3)
-    filter.bias(out)
-    assert list(out) == [b, -b, 5]
-    filter.bias_mdps(out)
-    assert list(out)[:2] == [round(b * 1000 / 256 / 16.4), round(-b * 1000 / 256 / 16.4)]
-
-
-@pytest.mark.parametrize("b", [8192 * 256 + 1, -8192 * 256 - 1, 1.5])
-def test_a_bias_that_the_numbers_cannot_hold_is_refused(b):
-    with pytest.raises(ValueError, match=r"bias is .*, at most \+-2097152"):
-        Euler6(200, SCALE, 4096).set_bias(0, b, 0)
-
-
 # -- the kinematics
 angle = st.integers(-170, 170)
 tilt = st.integers(-70, 70)

@@ -630,70 +630,6 @@ def test_the_names_of_the_registry():
         )
 
 
-@pytest.mark.parametrize("yaw", [0, 40, 120, -90, 179])
-def test_seed_takes_the_heading_of_the_magnetometer(yaw):
-    q = motions.quaternion_zyx(yaw, 20, -35)
-    turn = motions._matrix(q[None])[0]
-    accel, mag = 4096 * turn[2], FIELD_UT @ turn / 0.3
-    row = counts(*(round(v) for v in accel), 0, 0, 0, *(round(v) for v in mag), flags=3)
-    filter = Inertial9(200, SCALE, 4096)
-    assert filter.seed(row) is True
-    assert angles_between(np.array([filter.quaternion_floats()]), q[None])[0] < 0.5
-    filter.update(row)
-    assert angles_between(np.array([filter.quaternion_floats()]), q[None])[0] < 0.5
-    for kind, flags in ((Inertial6, 3), (Inertial9, 1)):
-        filter = kind(200, SCALE, 4096)
-        row[10] = flags
-        filter.seed(row)
-        out = array("i", [0] * 3)
-        filter.angles(out)
-        assert abs(out[2]) < 20 and abs(out[1] - 20000) < 100
-
-
-def test_seed_without_gravity_or_with_the_field_upright():
-    filter = Inertial9(200, SCALE, 4096)
-    assert filter.seed(counts(0, 0, 255)) is False
-    assert filter.quaternion_floats() == (1, 0, 0, 0)
-    assert filter.seed(counts(0, 0, 4096, 0, 0, 0, 0, 0, -150, flags=3)) is True
-    assert filter.quaternion_floats() == (1, 0, 0, 0)
-
-
-@pytest.mark.parametrize("b", [8192 * 256, -8192 * 256, 12345, -1, 0])
-def test_the_bias_reads_back(b):
-    filter = Inertial9(200, SCALE, 4096)
-    filter.set_bias(b, -b, 5)
-    out = array("i", [0] * 3)
-    filter.bias(out)
-    assert list(out) == [b, -b, 5]
-    filter.bias_mdps(out)
-    assert list(out)[:2] == [round(b * 1000 / 256 / 16.4), round(-b * 1000 / 256 / 16.4)]
-
-
-@pytest.mark.parametrize("b", [8192 * 256 + 1, 1.5])
-def test_a_bias_that_the_numbers_cannot_hold_is_refused(b):
-    with pytest.raises(ValueError, match=r"bias is .*, at most \+-2097152"):
-        Inertial9(200, SCALE, 4096).set_bias(0, b, 0)
-
-
-def test_a_bias_that_was_set_is_subtracted_and_what_is_learnt_comes_on_top():
-    filter = Inertial6(200, SCALE, 4096)
-    filter.set_bias(0, 0, 820 * 256)  # 50 deg/s
-    out = array("i", [0] * 3)
-    run(filter, counts(gz=820), 200)
-    filter.angles(out)
-    assert abs(out[2]) < 5
-    run(filter, counts(gz=820 + 33), 200 * 10)  # 2.01 deg/s more
-    filter.bias_mdps(out)
-    assert out[2] == pytest.approx(853000 / 16.4, abs=50)
-    saved = array("i", [0] * 3)
-    filter.bias(saved)
-    fresh = Inertial6(200, SCALE, 4096)
-    fresh.set_bias(*saved)
-    run(fresh, counts(gz=853), 200)
-    fresh.angles(out)
-    assert abs(out[2]) < 60
-
-
 def test_it_coasts_on_the_last_gyro_words_without_feedback():
     filter = Inertial9(200, SCALE, 4096)
     run(filter, counts(flags=3), 200 * 4)
@@ -740,16 +676,6 @@ def test_what_it_says_of_itself():
     assert not filter.resting and not filter.mag_accepted
     assert filter.tilt_confidence < 400
     assert filter.heading_uncertainty_mdeg > near
-
-
-def test_a_magnetometer_sample_that_cannot_be_is_not_used():
-    for bad in ((0, 0, 0), (32767, 0, 0), (-32768, 5, 5), (5, 5, -32767)):
-        filter = Inertial9(200, SCALE, 4096)
-        run(filter, counts(mx=bad[0], my=bad[1], mz=bad[2], flags=3), 200)
-        assert not filter.mag_accepted
-        out = array("i", [0] * 3)
-        filter.angles(out)
-        assert out[2] == 0
 
 
 def test_six_axes_and_lite_leave_out_what_they_say():

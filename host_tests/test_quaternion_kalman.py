@@ -592,70 +592,6 @@ def test_the_names_of_the_registry():
         assert list(out) == [ONE, 0, 0, 0] == q
 
 
-@pytest.mark.parametrize("yaw", [0, 40, -90, 179])
-def test_seed_takes_the_heading_of_the_magnetometer(yaw):
-    q = motions.quaternion_zyx(yaw, 20, -35)
-    turn = motions._matrix(q[None])[0]
-    accel, mag = 4096 * turn[2], np.array([66, 0, -150]) @ turn
-    row = counts(*(round(v) for v in accel), 0, 0, 0, *(round(v) for v in mag), flags=3)
-    filter = QuaternionKalman9(200, SCALE, 4096)
-    assert filter.seed(row) is True
-    assert angles_between(np.array([filter.quaternion_floats()]), q[None])[0] < 0.5
-    run(filter, row, 20)
-    assert angles_between(np.array([filter.quaternion_floats()]), q[None])[0] < 0.7
-    for kind, flags in ((QuaternionKalman6, 3), (QuaternionKalman9, 1)):
-        filter = kind(200, SCALE, 4096)
-        row[10] = flags
-        filter.seed(row)
-        out = array("i", [0] * 3)
-        filter.angles(out)
-        assert abs(out[2]) < 20 and abs(out[1] - 20000) < 100
-
-
-def test_seed_without_gravity_or_with_the_field_upright():
-    filter = QuaternionKalman9(200, SCALE, 4096)
-    assert filter.seed(counts(0, 0, 255)) is False
-    assert filter.quaternion_floats() == (1, 0, 0, 0)
-    assert filter.seed(counts(0, 0, 4096, 0, 0, 0, 0, 0, -150, flags=3)) is True
-    assert filter.quaternion_floats() == (1, 0, 0, 0)
-
-
-@pytest.mark.parametrize("b", [8192 * 256, -8192 * 256, 12345, -1, 0])
-def test_the_bias_reads_back(b):
-    filter = QuaternionKalman9(200, SCALE, 4096)
-    filter.set_bias(b, -b, 5)
-    out = array("i", [0] * 3)
-    filter.bias(out)
-    assert list(out) == [b, -b, 5]
-    filter.bias_mdps(out)
-    assert list(out)[:2] == [round(b * 1000 / 256 / 16.4), round(-b * 1000 / 256 / 16.4)]
-
-
-@pytest.mark.parametrize("b", [8192 * 256 + 1, 1.5])
-def test_a_bias_that_the_numbers_cannot_hold_is_refused(b):
-    with pytest.raises(ValueError, match=r"bias is .*, at most \+-2097152"):
-        QuaternionKalman9(200, SCALE, 4096).set_bias(0, b, 0)
-
-
-def test_a_bias_that_was_set_is_subtracted_and_what_is_learnt_comes_on_top():
-    filter = QuaternionKalman6(200, SCALE, 4096)
-    filter.set_bias(0, 0, 820 * 256)  # 50 deg/s
-    out = array("i", [0] * 3)
-    run(filter, counts(gz=820), 200)
-    filter.angles(out)
-    assert abs(out[2]) < 5
-    run(filter, counts(gz=820 + 33), 200 * 10)  # 2.01 deg/s more
-    filter.bias_mdps(out)
-    assert out[2] == pytest.approx(853000 / 16.4, abs=50)
-    saved = array("i", [0] * 3)
-    filter.bias(saved)
-    fresh = QuaternionKalman6(200, SCALE, 4096)
-    fresh.set_bias(*saved)
-    run(fresh, counts(gz=853), 200)
-    fresh.angles(out)
-    assert abs(out[2]) < 60
-
-
 def test_it_coasts_on_the_last_gyro_words_without_feedback():
     filter = QuaternionKalman9(200, SCALE, 4096)
     run(filter, counts(flags=3), 200 * 4)
@@ -684,16 +620,6 @@ def test_what_it_says_of_itself():
     for _ in range(600):
         filter.update(counts(*(rng.randint(-9000, 9000) for _ in range(3)), gx=400, flags=1))
     assert not filter.resting and not filter.mag_accepted
-
-
-def test_a_magnetometer_sample_that_cannot_be_is_not_used():
-    for bad in ((0, 0, 0), (32767, 0, 0), (-32768, 5, 5), (5, 5, -32767)):
-        filter = QuaternionKalman9(200, SCALE, 4096)
-        run(filter, counts(mx=bad[0], my=bad[1], mz=bad[2], flags=3), 200)
-        assert not filter.mag_accepted
-        out = array("i", [0] * 3)
-        filter.angles(out)
-        assert out[2] == 0
 
 
 def test_six_axes_do_not_look_at_the_magnetometer():
