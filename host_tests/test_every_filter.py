@@ -250,12 +250,19 @@ def test_the_firmware_shows_what_the_dmp_says(boot_board, hand, tmp_path, versio
     assert score.aligned_total < (0.5 if rate == 200 else 3)
 
 
+@pytest.mark.parametrize(
+    "faults",
+    [
+        [[2_000_000, "imu", "brown_out"]],
+        [[2_000_000, "imu", "vanish"], [2_700_000, "imu", "come_back"]],
+    ],
+    ids=["brown-out", "gone for a while"],
+)
 def test_a_dmp_that_lost_its_program_gets_it_again_and_the_display_lives_on(
-    boot_board, hand, tmp_path, runtime
+    boot_board, hand, tmp_path, runtime, faults
 ):
     config = dmp_board(tmp_path, dmp_images.V612)
-    fault = [2_000_000, "imu", "brown_out"]
-    boot = boot_board(runtime, world=str(hand[1]), seconds=5, faults=[fault], **config)
+    boot = boot_board(runtime, world=str(hand[1]), seconds=5, faults=faults, **config)
     healthy(boot.result)
     assert boot.result["resets"] == 1
     assert "dmp: loaded again" in boot.lines
