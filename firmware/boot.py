@@ -4,7 +4,7 @@
 import micropython
 
 try:
-    import update
+    from upright_app import update
 
     update.finish()
 except ImportError:

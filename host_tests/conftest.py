@@ -8,12 +8,15 @@ from pathlib import Path
 import hypothesis
 
 ROOT = Path(__file__).resolve().parents[1]
-for folder in ("boards/sim", "firmware", "lib", "host_tests", "host_tests/sim", "host_tests/shim"):
+for folder in (
+    *("boards/sim", "firmware", "lib", "host_tests"),
+    *("tools/simulator", "tools/simulator/shim"),
+):
     sys.path.insert(0, str(ROOT / folder))
 
 import micropython  # noqa: E402, F401  (the shim: it prepares `time` before anything of lib/ is imported)
 import pytest  # noqa: E402
-from upright import oled, runtimes, simulate, trials  # noqa: E402
+from upright_host import oled, runtimes, simulate, trials  # noqa: E402
 
 PORTABLE = Path(__file__).parent / "portable"
 
@@ -88,7 +91,7 @@ Boot = namedtuple("Boot", "result lines picture rows q29 times flags")
 def boot_board(tmp_path):
     """boot_board(runtime=None, flash=None, **config) -> Boot: the firmware run on a simulated board, to its end.
 
-    config: that of host_tests/sim/run_firmware.py. lines: the console; picture: the display's last, as rows;
+    config: that of tools/simulator/run_firmware.py. lines: the console; picture: the display's last, as rows;
     for each step the world's row, the attitude (Q29), its time in us, and its sample's flags.
     """
 

@@ -6,9 +6,9 @@ import kernel
 import machine
 from chips.mpu6050 import MPU6050Chip
 from chips.mpu6500 import MPU6500Chip
-from mpu6050 import MPU6050
-from mpu6500 import MPU6500
-from mpu_dmp import MpuDmp
+from upright.dmp import MpuDmp
+from upright.mpu6050 import MPU6050
+from upright.mpu6500 import MPU6500
 from world import StillWorld
 
 V612 = random.Random(612).randbytes(3062)

@@ -10,6 +10,8 @@ import sys
 import types
 from dataclasses import dataclass, field
 
+import upright
+
 LOW, HIGH = -(1 << 31), (1 << 31) - 1
 SMALL = 1 << 30  # an argument or result beyond +- this is boxed on a 32-bit port
 
@@ -152,8 +154,7 @@ class _Checks(ast.NodeTransformer):
 def load(name, source, watch):
     """Execute the module text `source` as the module `name` with checked viper functions; returns the module.
 
-    While it is executed it is sys.modules[name], so that a module loaded later imports it: see
-    `loaded`.
+    A module loaded later may import it: see `loaded`.
     """
     tree = ast.parse(source)
     for node in ast.walk(tree):
@@ -178,12 +179,16 @@ def loaded(paths, watch):
     try:
         for path in paths:
             module = load(path.stem, path.read_text(), watch)
-            before[path.stem] = sys.modules.get(path.stem)
-            modules[path.stem] = sys.modules[path.stem] = module
+            name = f"upright.{path.stem}"
+            before[name] = sys.modules.get(name)
+            modules[path.stem] = sys.modules[name] = module
+            setattr(upright, path.stem, module)
     finally:
         for name, module in before.items():
             if module is None:
                 del sys.modules[name]
+                delattr(upright, name.partition(".")[2])
             else:
                 sys.modules[name] = module
+                setattr(upright, name.partition(".")[2], module)
     return modules

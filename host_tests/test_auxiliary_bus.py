@@ -3,7 +3,9 @@
 import kernel
 import machine
 import pytest
-from auxiliary_bus import (
+from chips.mpu6050 import MPU6050Chip
+from chips.mpu6500 import MPU6500Chip
+from upright.auxiliary_bus import (
     AUX_BUSY,
     AUX_DONE,
     AUX_IDLE,
@@ -14,10 +16,8 @@ from auxiliary_bus import (
     AuxiliaryNack,
     AuxiliaryTimeout,
 )
-from chips.mpu6050 import MPU6050Chip
-from chips.mpu6500 import MPU6500Chip
-from mpu6050 import MPU6050
-from mpu6500 import MPU6500, MPU6500_I2C
+from upright.mpu6050 import MPU6050
+from upright.mpu6500 import MPU6500, MPU6500_I2C
 from world import StillWorld
 
 USER_CTRL, MST_CTRL, DELAY_CTRL, SLV4_CTRL, SLV4_ADDR = 0x6A, 0x24, 0x67, 0x34, 0x31

@@ -4,10 +4,10 @@ import importlib.util
 import sys
 
 import pytest
-from conftest import PORTABLE, require
-from fixmath import euler
-from mahony import Mahony6, Mahony9
-from upright import bench, tracing
+from conftest import require
+from upright.fixmath import euler
+from upright.mahony import Mahony6, Mahony9
+from upright_host import bench, tracing
 
 
 def log(*lines):
@@ -51,7 +51,9 @@ def test_loop_and_bus_are_subtracted():
 def expected(monkeypatch):
     """What 40 steps must come to: the same samples straight into the filter, under CPython."""
     monkeypatch.setattr(sys, "argv", ["bench_steps.py", "alloc", "1", "filters"])  # prints nothing
-    spec = importlib.util.spec_from_file_location("steps_for_test", PORTABLE / "bench_steps.py")
+    spec = importlib.util.spec_from_file_location(
+        "steps_for_test", bench.PROGRAMS / "bench_steps.py"
+    )
     steps = importlib.util.module_from_spec(spec)
     monkeypatch.setattr(sys, "path", list(sys.path))
     spec.loader.exec_module(steps)
@@ -84,7 +86,7 @@ def expected(monkeypatch):
 
 def test_every_runtime_runs_the_steps_and_gets_what_the_filter_gives(runtime, portable, expected):
     got = {}
-    for line in portable(runtime, "bench_steps.py", "check", 40).splitlines():
+    for line in portable(runtime, bench.PROGRAMS / "bench_steps.py", "check", 40).splitlines():
         name, *numbers = line.split()
         got[name] = [int(n) for n in numbers]
     floats = got.pop("float")

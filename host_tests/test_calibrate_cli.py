@@ -6,18 +6,18 @@ import re
 from array import array
 from types import SimpleNamespace
 
-import calibration
 import kernel
 import machine
 import numpy as np
 import pytest
-import record
 import typer
 import world
 from chips.mpu6050 import MPU6050Chip
-from mpu6050 import MPU6050
 from typer.testing import CliRunner
-from upright import calibrate, paths
+from upright import calibration
+from upright.mpu6050 import MPU6050
+from upright_app import record
+from upright_host import calibrate, paths
 
 import boards
 

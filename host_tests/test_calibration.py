@@ -10,12 +10,12 @@ from pathlib import Path
 from types import SimpleNamespace
 from zlib import crc32
 
-import calibration
 import overflow
 import pytest
-from calibration import Calibration, CalibrationError
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from upright import calibration
+from upright.calibration import Calibration, CalibrationError
 
 SOURCE = Path(calibration.__file__)
 UNIT = [1000000, 0, 0, 0, 1000000, 0, 0, 0, 1000000]

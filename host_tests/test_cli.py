@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from typer.testing import CliRunner
-from upright import cli, replay, scoring, simulate
+from upright_host import cli, replay, scoring, simulate
 
 
 @pytest.fixture

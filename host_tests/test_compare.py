@@ -12,7 +12,7 @@ import pytest
 import typer
 from conftest import require
 from typer.testing import CliRunner
-from upright import (
+from upright_host import (
     compare,
     filter_costs,
     paths,
@@ -24,7 +24,7 @@ from upright import (
     tracing,
     trials,
 )
-from upright.registry import filters as known_filters
+from upright_host.registry import filters as known_filters
 
 EVERY = 4
 # as a start 90 deg off comes down to 2 deg: tan(e / 2) falls with exp(-kp t)
@@ -32,7 +32,7 @@ MAHONY_SETTLES = math.log(math.tan(math.radians(45)) / math.tan(math.radians(1))
 
 INJECTED = '''
 from array import array
-from mahony import Mahony6
+from upright.mahony import Mahony6
 
 
 class Wasteful(Mahony6):
@@ -104,10 +104,11 @@ def run():
 @pytest.fixture
 def registry(tmp_path, monkeypatch):
     """registry(name=class name) puts filters of INJECTED into the firmware's registry."""
-    folder = tmp_path / "firmware"
-    shutil.copytree(paths.FIRMWARE, folder)
+    shutil.copytree(paths.LIB, tmp_path / "lib")
+    folder = tmp_path / "lib" / "upright"
     (folder / "injected.py").write_text(INJECTED)
-    monkeypatch.setattr(paths, "FIRMWARE", folder)
+    monkeypatch.setattr(paths, "LIB", tmp_path / "lib")
+    monkeypatch.setattr(paths, "PACKAGE", folder)
 
     def add(hardware=(), **filters):
         with open(folder / "filters.py", "a") as file:

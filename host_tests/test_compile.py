@@ -3,10 +3,10 @@
 import subprocess
 
 import pytest
-from upright import paths, runtimes
+from upright_host import paths, runtimes
 
 FILES = sorted(
-    [*paths.LIB.glob("*.py"), *paths.FIRMWARE.glob("*.py"), *paths.BOARDS.glob("*/board.py")]
+    [*paths.PACKAGE.glob("*.py"), *paths.FIRMWARE.rglob("*.py"), *paths.BOARDS.glob("*/board.py")]
 )
 TARGETS = [
     (version, march)

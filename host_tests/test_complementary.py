@@ -7,19 +7,18 @@ import random
 from array import array
 from pathlib import Path
 
-import complementary
-import euler_kernels
 import motions
 import numpy as np
 import overflow
 import pytest
-from complementary import Euler6
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
-from mahony import Mahony6
 from reference.complementary_float import EulerFloat
 from reference.mahony_float import angle_between
-from upright import runtimes, scoring, trials
+from upright import complementary, euler_kernels
+from upright.complementary import Euler6
+from upright.mahony import Mahony6
+from upright_host import runtimes, scoring, trials
 
 ONE = 1 << 29
 TURN = 1 << 30

@@ -4,12 +4,12 @@ import hashlib
 import subprocess
 import sys
 
-import mpu_dmp_image
 import pytest
 import typer
 from dmp_images import LIST, V20, V612
 from typer.testing import CliRunner
-from upright import dmp
+from upright import dmp_image as mpu_dmp_image
+from upright_host import dmp
 
 APP = typer.Typer()
 dmp.register(APP)
@@ -199,7 +199,7 @@ def test_no_image_is_taken_for_text():
 
 
 def test_the_image_module_needs_neither_the_shim_nor_numpy():
-    code = "import sys; sys.path.insert(0, sys.argv[1]); import mpu_dmp_image; print(len(mpu_dmp_image.KNOWN))"
+    code = "import sys; sys.path.insert(0, sys.argv[1]); from upright import dmp_image; print(len(dmp_image.KNOWN))"
     done = subprocess.run(
         [sys.executable, "-S", "-c", code, str(dmp.paths.LIB)], capture_output=True, text=True
     )

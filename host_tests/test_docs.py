@@ -6,7 +6,7 @@ import kernel
 import machine
 import pytest
 from chips.mpu6050 import MPU6050Chip
-from upright import cli, paths
+from upright_host import cli, paths
 from world import StillWorld
 
 PAGES = sorted(

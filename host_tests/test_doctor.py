@@ -5,11 +5,11 @@ import itertools
 import json
 import math
 
-import axis_check
 import motions
 import numpy as np
 import pytest
-from upright import runtimes
+from upright_app import axis_check
+from upright_host import runtimes
 
 RATE = 100
 GYRO_BIAS_DPS = np.array(motions.DEFAULT_ERRORS.gyro_bias_dps)
@@ -253,7 +253,7 @@ machine.power_on()
 world = World(told["world"]) if told["world"] else StillWorld()
 world.start(0)
 import board
-import doctor
+from upright_app import doctor
 parts = boards.wire(told["name"], board, world, told["options"])
 for name, value in told["settings"].items():
     setattr(board, name, tuple(value) if isinstance(value, list) else value)

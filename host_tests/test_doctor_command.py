@@ -2,7 +2,7 @@
 
 import pytest
 from typer.testing import CliRunner
-from upright import cli, device, doctor, paths
+from upright_host import cli, device, doctor, paths
 
 FACTS = device.Facts("rp2", "Pico", (1, 26, 1), 6, 3, "armv6m", True, False, True, True, 900000)
 
@@ -56,7 +56,7 @@ def test_every_board_boots_its_parts_in_simulation(folder):
 
 def test_lines_of_a_board_are_passed_on_as_they_come_in_whatever_pieces(known):
     board = Board(
-        {"board.py": b'PLATFORM = "rp2"', "doctor.mpy": b""},
+        {"board.py": b'PLATFORM = "rp2"', "lib/upright_app/doctor.mpy": b""},
         [b"heap: 1", b"00 bytes\r\nsen", b"sor: x\r\n\x1e['bad']\r\n"],
     )
     lines = []
@@ -66,7 +66,7 @@ def test_lines_of_a_board_are_passed_on_as_they_come_in_whatever_pieces(known):
 
 
 def test_the_check_of_the_axes_is_asked_for_by_its_hemisphere(known):
-    board = Board({"board.py": b"", "doctor.py": b""}, [b"\x1e[]\n"])
+    board = Board({"board.py": b"", "lib/upright_app/doctor.py": b""}, [b"\x1e[]\n"])
     assert doctor.examine(board, True, True, print) == []
     assert "doctor.axes(board, True)" in board.ran[0]
 
@@ -74,7 +74,9 @@ def test_the_check_of_the_axes_is_asked_for_by_its_hemisphere(known):
 def test_a_board_without_the_firmware_or_with_that_of_another_is_named(known):
     with pytest.raises(device.DeviceError, match="upright flash"):
         doctor.examine(Board({}, []), False, False, print)
-    board = Board({"board.py": b'PLATFORM = "esp32"', "doctor.mpy": b""}, [b"\x1e[]\n"])
+    board = Board(
+        {"board.py": b'PLATFORM = "esp32"', "lib/upright_app/doctor.mpy": b""}, [b"\x1e[]\n"]
+    )
     assert doctor.examine(board, False, False, print) == [
         "board.py is for the port 'esp32', this is 'rp2'"
     ]

@@ -6,14 +6,14 @@ import sys
 from array import array
 
 import dmp_images
-import filters
 import motions
 import numpy as np
 import pytest
 from conftest import healthy
 from test_inertial import FIELD_UT, errors, scene
 from test_rp2040 import as_trial
-from upright import replay, scoring, simulate
+from upright import filters
+from upright_host import replay, scoring, simulate
 
 SOFTWARE = [name for name in filters.FILTERS if name not in filters.HARDWARE]
 AT_REST = array("h", [0, 0, 4096, 10, -20, 30, 66, 0, -150, 0, 3])
@@ -183,7 +183,7 @@ def test_an_unknown_name_is_refused_with_those_that_there_are():
 
 
 def test_a_module_that_is_not_on_the_board_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "kalman", None)
+    monkeypatch.setitem(sys.modules, "upright.kalman", None)
     with pytest.raises(ValueError, match=r"kalman.py is not on this board: .* FILTER = 'kalman6'"):
         filters.make("kalman6", 200, Scales, {})
 

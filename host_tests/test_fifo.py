@@ -11,8 +11,8 @@ from chips.mpu6050 import MPU6050Chip
 from chips.mpu6500 import MPU6500Chip
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from mpu6050 import HEALTH_OK, MPU6050
-from mpu6500 import MPU6500, MPU6500_I2C
+from upright.mpu6050 import HEALTH_OK, MPU6050
+from upright.mpu6500 import MPU6500, MPU6500_I2C
 from world import StillWorld
 
 WORDS = (0, 1, 2, 9, 3, 4, 5)  # places in a row of the words of a packet

@@ -6,7 +6,7 @@ Every run is a process of its own on a runtime; faults are put in at their simul
 import numpy as np
 import pytest
 from conftest import healthy
-from upright import demo, scoring, simulate
+from upright_host import demo, scoring, simulate
 
 SECOND = 1000000
 

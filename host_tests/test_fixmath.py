@@ -5,12 +5,11 @@ import random
 from array import array
 from fractions import Fraction
 
-import fixmath
-import mahony
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from reference import mahony_float
+from upright import fixmath, mahony
 
 ONE = fixmath.ONE
 int16 = st.integers(-32768, 32767)

@@ -10,7 +10,7 @@ from conftest import require
 from mpremote.transport import TransportExecError
 from typer.testing import CliRunner
 from unix_board import PowerCut, UnixBoard
-from upright import cli, device, flash, paths, runtimes
+from upright_host import cli, device, flash, paths, runtimes
 
 
 @pytest.fixture
@@ -35,10 +35,10 @@ def files_of(version):
     """A small installation: sources as they are, and some modules."""
     return {
         "boot.py": (paths.FIRMWARE / "boot.py").read_bytes(),
-        "update.py": (paths.FIRMWARE / "update.py").read_bytes(),
+        "lib/upright_app/update.py": (paths.APPLICATION / "update.py").read_bytes(),
         "main.py": f"print('main {version}')".encode(),
         "board.py": b"NAME = 'x'",
-        "lib/a.py": f"VERSION = {version}".encode() * 40,
+        "lib/upright/a.py": f"VERSION = {version}".encode() * 40,
         f"lib/only_in_{version}.py": b"x = 1",
     }
 
@@ -60,7 +60,7 @@ def on_board(folder):
 def reboot(folder):
     """Boot: boot.py, then what main.py prints."""
     start, _ = runtimes.interpreter("unix")
-    code = "exec(open('boot.py').read())\nexec(open('main.py').read())"
+    code = "import sys\nsys.path.append('lib')\nexec(open('boot.py').read())\nexec(open('main.py').read())"
     return subprocess.run([*start, "-c", code], cwd=folder, capture_output=True, text=True)
 
 
@@ -75,8 +75,8 @@ def test_it_installs_and_the_second_time_there_is_nothing_to_do(board):
 def test_only_what_changed_is_copied_and_what_is_gone_is_removed(board):
     install(board(), files_of(1))
     steps = install(board(), files_of(2))
-    assert set(steps.install) == {"main.py", "lib/a.py", "lib/only_in_2.py"}
-    assert steps.remove == ["lib/only_in_1.py"]
+    assert set(steps.install) == {"main.py", "lib/upright/a.py", "lib/upright/only_in_2.py"}
+    assert steps.remove == ["lib/upright/only_in_1.py"]
     assert on_board(board.folder) == files_of(2)
 
 
@@ -133,11 +133,11 @@ def test_a_boot_that_is_itself_interrupted_ends_the_same(board, left):
     install(board(), files_of(1))
     for name, content in files_of(2).items():
         (board.folder / (name + flash.NEW)).write_bytes(content)
-    journal = {"install": list(files_of(2)), "remove": ["lib/only_in_1.py"]}
+    journal = {"install": list(files_of(2)), "remove": ["lib/upright/only_in_1.py"]}
     (board.folder / flash.JOURNAL).write_text(json.dumps(journal))
     cut = board()
     with pytest.raises(Exception, match="power"):
-        update = (paths.FIRMWARE / "update.py").read_text()
+        update = (paths.APPLICATION / "update.py").read_text()
         update = update.replace("import os\n", "os_ = Os\n").replace("os.", "os_.")
         cut.exec(FAILING_OS.replace("LEFT", str(left)) + update + "\nfinish()")
     assert reboot(board.folder).stdout.strip() == "main 2"
@@ -176,7 +176,7 @@ def test_sources_give_way_to_compiled_modules_of_their_name(board):
     (board.folder / "lib" / "a.py").write_text("old = 1")
     files = {"lib/a.mpy": b"M", "main.py": b""}
     steps = install(board(), files)
-    assert steps.remove == ["lib/a.py"]
+    assert steps.remove == ["lib/upright/a.py"]
     assert on_board(board.folder) == files
 
 
@@ -192,13 +192,13 @@ def test_a_board_without_hashlib_is_compared_all_the_same(board):
     bare = Bare(board.folder)
     steps = install(bare, files_of(2))
     bare.close()
-    assert set(steps.install) == {"main.py", "lib/a.py", "lib/only_in_2.py"}
+    assert set(steps.install) == {"main.py", "lib/upright/a.py", "lib/upright/only_in_2.py"}
     assert on_board(board.folder) == files_of(2)
 
 
 def test_what_the_emulated_board_needs_is_named_where_it_is_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "rp2040", None)
-    with pytest.raises(device.DeviceError, match=r"no emulated board: .*rp2040"):
+    with pytest.raises(runtimes.Unavailable, match=r"no emulated board: .*rp2040"):
         device.open_board(None, emulated=True)
 
 
@@ -211,28 +211,28 @@ def test_facts_of_a_board_and_files_that_it_can_load(board):
     facts.architecture = "armv6m"
     files = flash.board_files("pico", facts)
     assert files["board.py"] == (paths.BOARDS / "pico" / "board.py").read_bytes()
-    assert files["lib/fixmath.mpy"][:2] == b"M\x06"
-    assert "lib/fixmath.py" not in files
+    assert files["lib/upright/fixmath.mpy"][:2] == b"M\x06"
+    assert "lib/upright/fixmath.py" not in files
     assert "main.py" in files
     # of the filters the one that it runs, and that of a board.py that may stay
-    assert "lib/inertial_mahony.mpy" in files and "lib/mahony.mpy" not in files
-    assert "lib/mahony.mpy" in flash.board_files("pico", facts, own='FILTER = "mahony6"\n')
+    assert "lib/upright/inertial.mpy" in files and "lib/upright/mahony.mpy" not in files
+    assert "lib/upright/mahony.mpy" in flash.board_files("pico", facts, own='FILTER = "mahony6"\n')
     with pytest.raises(device.DeviceError, match="unknown board"):
         flash.board_files("abacus", facts)
 
 
 @pytest.mark.parametrize("board_py, has, lacks", [
-    ("", {"inertial_mahony", "inertial_kernels"}, {"mahony", "ist8310", "mpu_dmp", "kalman"}),
-    ('FILTER = "kalman6"', {"kalman", "euler_kernels", "fixmath"}, {"inertial_mahony", "mpu_dmp"}),
-    ('FILTER = "dmp6"\nimport mpu6500', {"mpu_dmp", "mpu_dmp_image", "mpu6500"}, {"mahony"}),
-    ("FILTER = None\ndef f():\n    import ist8310", {"inertial_mahony", "ist8310", "auxiliary_bus"}, {"mahony"}),
-    ("import os\nFILTER = os.environ", {"inertial_mahony", "mahony", "quaternion_kalman", "mpu_dmp"}, {"ist8310"}),
+    ("", {"inertial", "inertial_kernels"}, {"mahony", "ist8310", "dmp", "kalman"}),
+    ('FILTER = "kalman6"', {"kalman", "euler_kernels", "fixmath"}, {"inertial", "dmp"}),
+    ('FILTER = "dmp6"\nfrom upright import mpu6500', {"dmp", "dmp_image", "mpu6500"}, {"mahony"}),
+    ("FILTER = None\ndef f():\n    from upright import ist8310", {"inertial", "ist8310", "auxiliary_bus"}, {"mahony"}),
+    ("import os\nFILTER = os.environ", {"inertial", "mahony", "quaternion_kalman", "dmp"}, {"ist8310"}),
 ])  # fmt: skip
 def test_a_board_gets_the_library_that_it_needs(board_py, has, lacks):
     needed = flash.library(board_py)
     assert has <= needed and not lacks & needed
     assert {"fixmath", "calibration", "ssd1306"} <= needed
-    assert all((paths.LIB / f"{module}.py").exists() for module in needed)
+    assert all((paths.PACKAGE / f"{module}.py").exists() for module in needed)
 
 
 def test_an_old_micropython_without_viper_is_refused_with_both_reasons():

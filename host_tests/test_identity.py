@@ -3,7 +3,7 @@
 import motions
 import numpy as np
 import pytest
-from upright import replay, scoring, simulate, trials
+from upright_host import replay, scoring, simulate, trials
 
 RATES = {
     "static": 50,

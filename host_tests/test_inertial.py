@@ -7,17 +7,17 @@ import subprocess
 from array import array
 from pathlib import Path
 
-import fixmath
-import inertial_kernels as kernels
 import motions
 import numpy as np
 import overflow
 import pytest
-from inertial_mahony import Inertial6, Inertial9, Inertial9Lite, InertialMahony
 from reference import inertial_float
-from upright import runtimes, scoring, trials
+from upright import fixmath
+from upright import inertial_kernels as kernels
+from upright.inertial import Inertial6, Inertial9, Inertial9Lite, InertialMahony
+from upright_host import runtimes, scoring, trials
 
-LIB = runtimes.paths.LIB
+LIB = runtimes.paths.PACKAGE
 ONE = 1 << 29
 SCALE = (82, 5)  # LSB per deg/s at +-2000 deg/s
 SCALES = {250: (131, 1), 500: (131, 2), 1000: (164, 5), 2000: (82, 5)}
@@ -433,7 +433,7 @@ def test_compiles_for_every_board(tmp_path, version, arch):
         compiler = runtimes.mpy_cross(version)
     except runtimes.Unavailable as why:
         pytest.skip(f"mpy-cross {version}: {why}")
-    for module in ("inertial_kernels", "inertial_mahony"):
+    for module in ("inertial_kernels", "inertial"):
         argv = [compiler, f"-march={arch}", "-o", tmp_path / "out.mpy", LIB / f"{module}.py"]
         done = subprocess.run(argv, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
@@ -445,7 +445,7 @@ def constants(module):
 
 
 def test_both_modules_mean_the_same_words():
-    ours, theirs = constants("inertial_mahony"), constants("inertial_kernels")
+    ours, theirs = constants("inertial"), constants("inertial_kernels")
     shared = ours.keys() & theirs.keys()
     assert len(shared) > 80
     assert {name: ours[name] for name in shared} == {name: theirs[name] for name in shared}
@@ -471,9 +471,9 @@ CORNERS = [
 @pytest.fixture(scope="module")
 def checked():
     watch = overflow.Watch()
-    names = ("fixmath", "inertial_kernels", "inertial_mahony")
+    names = ("fixmath", "inertial_kernels", "inertial")
     modules = overflow.loaded([LIB / f"{name}.py" for name in names], watch)
-    return watch, modules["inertial_mahony"]
+    return watch, modules["inertial"]
 
 
 def word(rng):

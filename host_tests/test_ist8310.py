@@ -6,13 +6,13 @@ from itertools import pairwise
 import kernel
 import machine
 import pytest
-from auxiliary_bus import AuxiliaryBus
 from chips.ist8310 import IST8310Chip
 from chips.mpu6050 import MPU6050Chip
 from chips.mpu6500 import MPU6500Chip
-from ist8310 import IST8310, IST8310_I2C, IST8310Error
-from mpu6050 import MPU6050
-from mpu6500 import MPU6500, MPU6500_I2C
+from upright.auxiliary_bus import AuxiliaryBus
+from upright.ist8310 import IST8310, IST8310_I2C, IST8310Error
+from upright.mpu6050 import MPU6050
+from upright.mpu6500 import MPU6500, MPU6500_I2C
 from world import StillWorld
 
 FRESH, MAG_FRESH = 1, 2

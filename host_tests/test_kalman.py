@@ -7,19 +7,18 @@ import random
 from array import array
 from pathlib import Path
 
-import complementary
-import kalman
 import motions
 import numpy as np
 import overflow
 import pytest
-from complementary import Euler6
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from kalman import Kalman6, KalmanFilter
 from reference.kalman_float import KalmanFloat, PerAngleFloat, ScalarFloat
 from reference.mahony_float import angle_between
-from upright import runtimes, trials
+from upright import complementary, kalman
+from upright.complementary import Euler6
+from upright.kalman import Kalman6, KalmanFilter
+from upright_host import runtimes, trials
 
 ONE = 1 << 29
 TURN = 1 << 30

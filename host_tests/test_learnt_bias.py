@@ -1,9 +1,9 @@
 """A filter that learns the gyro's bias: nobody waits for it, the status page shows it, and the next start has it."""
 
-import calibration
 import numpy as np
 import pytest
-from upright import scoring
+from upright import calibration
+from upright_host import scoring
 
 INERTIAL = {"FILTER": "inertial6", "PAGE_SECONDS": 0}
 

@@ -4,17 +4,16 @@ import math
 import random
 from array import array
 
-import fixmath
-import mahony
 import motions
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from mahony import Mahony6
 from reference import mahony_float
 from reference.mahony_float import MahonyFloat
-from upright import runtimes, trials
+from upright import fixmath, mahony
+from upright.mahony import Mahony6
+from upright_host import runtimes, trials
 
 ONE = 1 << 29
 SCALE = (82, 5)
@@ -177,7 +176,7 @@ def test_compiles_for_every_board(tmp_path, version, arch, module):
         compiler = runtimes.mpy_cross(version)
     except runtimes.Unavailable as why:
         pytest.skip(f"mpy-cross {version}: {why}")
-    source = runtimes.paths.LIB / f"{module}.py"
+    source = runtimes.paths.PACKAGE / f"{module}.py"
     argv = [compiler, f"-march={arch}", "-o", tmp_path / "out.mpy", source]
     done = subprocess.run(argv, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

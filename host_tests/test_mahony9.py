@@ -3,16 +3,15 @@
 import math
 from array import array
 
-import fixmath
-import mahony
 import motions
 import numpy as np
 import pytest
-from mahony import Mahony6, Mahony9
 from reference import mahony_float
 from reference.mahony_float import Mahony9Float
 from test_mahony import GAINS, SCALE, angles_between, compare, quickest
-from upright import scoring, trials
+from upright import fixmath, mahony
+from upright.mahony import Mahony6, Mahony9
+from upright_host import scoring, trials
 
 EVERY = [1, 3, 10]  # steps from one magnetometer sample to the next
 OF_SIX = slice(0, mahony._MAG_MOST)  # the words that both filters have

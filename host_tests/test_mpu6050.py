@@ -4,7 +4,7 @@ import kernel
 import machine
 import pytest
 from chips.mpu6050 import MPU6050Chip
-from mpu6050 import (
+from upright.mpu6050 import (
     HEALTH_BUS_ERROR,
     HEALTH_MISMATCH,
     HEALTH_OK,

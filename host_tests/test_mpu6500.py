@@ -8,8 +8,8 @@ import micropython
 import pytest
 from chips.mpu6050 import MPU6050Chip
 from chips.mpu6500 import MPU6500Chip
-from mpu6050 import MPU6050
-from mpu6500 import (
+from upright.mpu6050 import MPU6050
+from upright.mpu6500 import (
     HEALTH_BUS_ERROR,
     HEALTH_MISMATCH,
     HEALTH_OK,
@@ -18,7 +18,7 @@ from mpu6500 import (
     MPU6500_I2C,
     MPU6500Error,
 )
-from upright import runtimes
+from upright_host import runtimes
 from world import StillWorld
 
 PORTABLE = Path(__file__).parent / "portable"

@@ -443,7 +443,7 @@ print(chip.misuse, chip.master.cut, chip.master.late)
 
 
 def test_every_runtime_sees_the_same_chip(runtime, tmp_path):
-    from upright import runtimes
+    from upright_host import runtimes
 
     script = tmp_path / "model.py"
     script.write_text(PORTABLE)

@@ -10,7 +10,6 @@ from pathlib import Path
 import kernel
 import machine
 import motions
-import mpu_dmp
 import numpy as np
 import overflow
 import pytest
@@ -18,13 +17,14 @@ from chips.mpu6050 import MPU6050Chip
 from dmp_images import IMAGES, LIST, V20, V612, running, ticks, wired
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mpu6050 import MPU6050, MPU6050Error
-from mpu_common import HEALTH_OK
-from mpu_dmp import MpuDmp, MpuDmpError
 from test_fifo import Hostile, plans
+from upright import dmp as mpu_dmp
+from upright.dmp import MpuDmp, MpuDmpError
+from upright.mpu6050 import MPU6050, MPU6050Error
+from upright.mpu_common import HEALTH_OK
 from world import StillWorld, World
 
-LIB = Path(__file__).resolve().parents[1] / "lib"
+LIB = Path(__file__).resolve().parents[1] / "lib" / "upright"
 ONE = 1 << 30
 FRESH = 1
 
@@ -732,7 +732,7 @@ def test_a_batch_that_the_fifo_cannot_hold_is_refused(batch):
 def checked():
     """(watch, modules) with checked viper functions; at the end nothing may have gone unexercised."""
     watch = overflow.Watch()
-    names = ("fixmath.py", "mpu_common.py", "mpu_dmp_setup.py", "mpu_dmp.py")
+    names = ("fixmath.py", "mpu_common.py", "dmp_setup.py", "dmp.py")
     return watch, overflow.loaded([LIB / name for name in names], watch)
 
 
@@ -747,7 +747,7 @@ def packet_of(words, size, fill):
 @pytest.mark.parametrize("axes", [("x", "y", "z"), ("z", "-y", "x"), ("y", "z", "x")], ids="".join)
 def test_no_intermediate_leaves_32_bits_whatever_is_in_a_packet(checked, image, axes):
     watch, modules = checked
-    dmp = modules["mpu_dmp"].MpuDmp(MPU6050(None), image, accept_unknown=True, axes=axes)
+    dmp = modules["dmp"].MpuDmp(MPU6050(None), image, accept_unknown=True, axes=axes)
     rng = random.Random(3)
     good = 0
     for k in range(600):
@@ -764,7 +764,7 @@ def test_no_intermediate_leaves_32_bits_whatever_is_in_a_packet(checked, image, 
         dmp._set_yaw(*(round(32768 * x) for x in c))
         raw = packet_of(words, dmp.image.packet, lambda: rng.choice((0, 0x7F, 0x80, 0xFF)))
         before = list(dmp.state)
-        flags = modules["mpu_dmp"]._parse(raw, 0, dmp.state, dmp.counts)
+        flags = modules["dmp"]._parse(raw, 0, dmp.state, dmp.counts)
         length = sum((w / ONE) ** 2 for w in words)
         assert (flags >= 0) is (abs(length - 1) < 1 / 64) or abs(abs(length - 1) - 1 / 64) < 1e-3
         if flags < 0:
@@ -775,13 +775,13 @@ def test_no_intermediate_leaves_32_bits_whatever_is_in_a_packet(checked, image, 
         q = [w / 2**29 for w in dmp.state[1:5]]
         assert math.sqrt(sum(x * x for x in q)) == pytest.approx(math.sqrt(length), abs=2e-4)
     assert good > 300
-    assert {"mpu_dmp._parse", "mpu_dmp._turn"} <= watch.called
+    assert {"dmp._parse", "dmp._turn"} <= watch.called
 
 
 def test_an_unjudged_packet_would_overflow(checked):
     """The twin: _turn is safe only with what _parse has let through."""
     _, modules = checked
-    dmp = modules["mpu_dmp"].MpuDmp(MPU6050(None), V612, accept_unknown=True, axes=("z", "-y", "x"))
+    dmp = modules["dmp"].MpuDmp(MPU6050(None), V612, accept_unknown=True, axes=("z", "-y", "x"))
     for i in range(4):
         dmp.state[5 + i] = 2 * ONE - 1 if dmp.state[14 + i] > 0 else -2 * ONE
     for i in range(16):

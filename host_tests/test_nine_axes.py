@@ -5,11 +5,11 @@ Every run is a process of its own on a runtime; faults are put in at their simul
 
 import json
 
-import calibration
 import numpy as np
 import pytest
 from conftest import healthy
-from upright import scoring, simulate
+from upright import calibration
+from upright_host import scoring, simulate
 
 SECOND = 1000000
 BOARD = "robomaster_a"

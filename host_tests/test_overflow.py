@@ -8,7 +8,7 @@ from pathlib import Path
 import overflow
 import pytest
 
-LIB = Path(__file__).resolve().parents[1] / "lib"
+LIB = Path(__file__).resolve().parents[1] / "lib" / "upright"
 SCALES = {250: (131, 1), 500: (131, 2), 1000: (164, 5), 2000: (82, 5)}
 ONE = 1 << 29
 

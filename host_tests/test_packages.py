@@ -10,12 +10,12 @@ import threading
 import pytest
 from conftest import require
 from unix_board import UnixBoard
-from upright import __version__, packages, paths, runtimes
+from upright_host import __version__, packages, paths, runtimes
 
 
 def test_the_package_files_are_as_they_would_be_written():
     wanted = packages.package_files()
-    assert set(paths.LIB.glob("*.json")) | {paths.ROOT / "package.json"} == set(wanted)
+    assert set(paths.PACKAGE.glob("*.json")) | {paths.ROOT / "package.json"} == set(wanted)
     for path, text in wanted.items():
         assert path.read_text() == text, f"{path.name}: run `upright packages`"
 
@@ -28,18 +28,19 @@ def test_every_module_is_in_a_package_and_every_version_is_the_projects():
         named |= {url.rpartition("/")[2] for _, url in package["urls"]}
         for _, url in package["urls"]:
             assert (path.parent / url).exists()
-    assert named == {path.name for path in paths.LIB.glob("*.py")}
+    assert named == {path.name for path in paths.PACKAGE.glob("*.py")}
 
 
 @pytest.mark.parametrize("name", packages.names())
 def test_a_package_can_be_imported_with_nothing_else_there(name, tmp_path):
     require("unix")
     for module in packages.modules(name):
-        shutil.copy(paths.LIB / f"{module}.py", tmp_path)
+        (tmp_path / "upright").mkdir(exist_ok=True)
+        shutil.copy(paths.PACKAGE / f"{module}.py", tmp_path / "upright")
     start, _ = runtimes.interpreter("unix")
     for module in packages.modules(name):
         done = subprocess.run(
-            [*start, "-c", f"import {module}"],
+            [*start, "-c", f"import upright.{module}"],
             cwd=tmp_path,
             env={"MICROPYPATH": str(tmp_path)},
             capture_output=True,
@@ -77,11 +78,11 @@ def test_mpremotes_mip_installs_from_the_index(index, tmp_path, mpy):
     try:
         mip._install_package(board, "mahony", index, "lib", None, mpy)
         mip._install_package(board, "ssd1306", index, "lib", __version__, mpy)
-        board.exec("import sys\nsys.path.append('lib')\nimport mahony, ssd1306")
+        board.exec("import sys\nsys.path.append('lib')\nfrom upright import mahony, ssd1306")
         board.exec("f = mahony.Mahony6(200, (82, 5), 4096)\nf.update(bytearray(22))")
     finally:
         board.close()
-    names = {path.stem for path in (flash / "lib").iterdir()}
+    names = {path.stem for path in (flash / "lib" / "upright").iterdir()}
     assert names == {*packages.modules("mahony"), *packages.modules("ssd1306")}
 
 
@@ -91,7 +92,7 @@ def test_mip_installs_a_package_file_of_a_clone(tmp_path):
     require("unix")
     board = UnixBoard(tmp_path)
     try:
-        mip._install_package(board, str(paths.LIB / "calibration.json"), "", "lib", None, True)
+        mip._install_package(board, str(paths.PACKAGE / "calibration.json"), "", "lib", None, True)
     finally:
         board.close()
-    assert [path.name for path in (tmp_path / "lib").iterdir()] == ["calibration.py"]
+    assert [path.name for path in (tmp_path / "lib" / "upright").iterdir()] == ["calibration.py"]

@@ -8,13 +8,13 @@ from array import array
 from pathlib import Path
 
 import machine
-import pages
 import pytest
-import ssd1306
 from chips.ssd1306 import SSD1306Chip
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from upright import oled, runtimes
+from upright import ssd1306
+from upright_app import pages
+from upright_host import oled, runtimes
 
 GOLDEN = Path(__file__).parent / "golden"
 SCRIPT = "pages_golden.py"

@@ -7,19 +7,19 @@ from array import array
 from functools import cache
 from pathlib import Path
 
-import fixmath
 import motions
 import numpy as np
 import overflow
 import pytest
-import quaternion_kernels as kernels
-from quaternion_kalman import QuaternionKalman, QuaternionKalman6, QuaternionKalman9
 from reference import quaternion_kalman_float
 from reference.inertial_float import start
 from test_inertial import all_axes, angles_between, as_start, errors, pushes, quickest, scene
-from upright import runtimes, scoring, trials
+from upright import fixmath
+from upright import quaternion_kernels as kernels
+from upright.quaternion_kalman import QuaternionKalman, QuaternionKalman6, QuaternionKalman9
+from upright_host import runtimes, scoring, trials
 
-LIB = runtimes.paths.LIB
+LIB = runtimes.paths.PACKAGE
 ONE = 1 << 29
 SCALE = (82, 5)  # LSB per deg/s at +-2000 deg/s
 SCALES = {250: (131, 1), 500: (131, 2), 1000: (164, 5), 2000: (82, 5)}

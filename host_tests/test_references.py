@@ -7,16 +7,16 @@ import math
 import re
 from array import array
 
-import fixmath
 import motions
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from mahony import Mahony6, Mahony9
 from reference import mahony_float
 from reference.mahony_float import Mahony9Float, MahonyFloat
-from upright import paths, scoring
+from upright import fixmath
+from upright.mahony import Mahony6, Mahony9
+from upright_host import paths, scoring
 
 ONE = 1 << 29
 

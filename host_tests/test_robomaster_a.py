@@ -8,8 +8,8 @@ import types
 
 import machine
 import pytest
-import timing
-from upright import debian, paths
+from upright import timing
+from upright_host import debian, paths
 
 BOARD = paths.BOARDS / "robomaster_a"
 DEFINITION = BOARD / "ROBOMASTER_A"
@@ -200,7 +200,7 @@ def board():
 
 
 def test_board_py_is_one_that_the_firmware_takes(board):
-    import config
+    from upright import settings as config
 
     settings = config.Config(board)
     assert (settings.RATE, settings.DRIVE, settings.FILTER) == ((1000, 1), "timer", "mahony9")
@@ -211,7 +211,7 @@ def test_board_py_is_one_that_the_firmware_takes(board):
 
 
 def test_the_magnetometers_map_makes_its_left_handed_frame_right_handed(board):
-    import axis_check
+    from upright_app import axis_check
 
     assert axis_check.handedness(axis_check.parse(board.IMU_AXES)) == 1
     assert axis_check.handedness(axis_check.parse(board.MAG_AXES)) == -1

@@ -18,9 +18,9 @@ from chips.mpu6050 import MPU6050Chip
 from chips.mpu6500 import MPU6500Chip
 from chips.ssd1306 import SSD1306Chip
 from rich.console import Console
-from upright import bench as bench_command
-from upright import replay, runtimes, scoring, tracing, trials
-from upright import rp2040 as firmware
+from upright_host import bench as bench_command
+from upright_host import emulated, replay, runtimes, scoring, tracing, trials
+from upright_host import rp2040 as firmware
 from world import StillWorld, World
 
 # A firmware that is not there yet is built first, which takes minutes.
@@ -84,7 +84,7 @@ def motion(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def files(version):
-    return rp2040.project(version, "pico", rp2040.TELL + "PAGE_SECONDS = 0\nFILTER = 'mahony6'\n")
+    return emulated.project(version, "pico", rp2040.TELL + "PAGE_SECONDS = 0\nFILTER = 'mahony6'\n")
 
 
 @pytest.fixture(scope="module")
@@ -170,7 +170,7 @@ def test_the_counts_are_the_worlds_rows(landed):
 
 
 def test_the_quaternions_are_cpythons_bit_for_bit(landed):
-    import filters
+    from upright import filters
 
     class Scales:
         gyro_scale = landed.world.gyro_scale
@@ -198,8 +198,8 @@ def test_the_attitude_is_right(landed, motion):
 @pytest.mark.parametrize("page", [0, 1])
 def test_the_displays_memory_is_what_cpythons_simulation_draws(landed, page):
     import machine
-    import pages
-    import ssd1306
+    from upright import ssd1306
+    from upright_app import pages
 
     landed.board.exec(
         "import time\n"
@@ -366,7 +366,7 @@ def nine(image, version, tmp_path_factory):
     path = tmp_path_factory.mktemp("nine") / "slow.imu"
     motion = motions.render("slow", rate=(1000, 1), seconds=3)
     motion.write(path)
-    files = rp2040.project(version)
+    files = emulated.project(version)
     files["board.py"] = (Path(rp2040.__file__).parent / "spi_board.py").read_bytes()
     board = rp2040.Board(image, files)
     board.motion = motion
@@ -682,8 +682,8 @@ def test_modules_compiled_for_another_machine_are_refused(bench, version, tmp_pa
     module.write_text(
         "import micropython\n@micropython.viper\ndef f(x: int) -> int:\n    return x + 1\n"
     )
-    cross = rp2040.files.mpy_cross(version)
-    right = rp2040.compile_module(module, cross)
+    cross = emulated.mpy_cross(version)
+    right = emulated.compile_module(module, cross)
     for data, expected in ((right, "2"), (right[:2] + bytes([right[2] ^ 0x30]) + right[3:], "no")):
         said = bench.exec(
             f"with open('probe.mpy', 'wb') as file:\n    file.write({data!r})\n"
@@ -763,7 +763,7 @@ def test_cycles_are_counted_between_a_programs_marks(image, version, tmp_path):
         "        spin(steps * each)\n"
         "        print('@end %s %d' % (part, steps))\n"
     )
-    files = {"counts.mpy": rp2040.compile_module(source, rp2040.files.mpy_cross(version))}
+    files = {"counts.mpy": emulated.compile_module(source, emulated.mpy_cross(version))}
     of = tracing.per_step(rp2040.between_marks(image, files, "counts", "trace", 100))
     assert of.keys() == {"less", "more"}
     assert 100 * 3 < of["less"] < 100 * 30
@@ -834,7 +834,7 @@ def test_without_a_way_into_a_root_folder_the_reason_is_one_line(monkeypatch, tm
 
 
 def test_a_dead_mirror_is_said_and_leaves_nothing_behind(monkeypatch, tmp_path):
-    from upright import debian
+    from upright_host import debian
 
     if not debian.shutil.which("apt-get"):
         pytest.skip("no apt-get here")

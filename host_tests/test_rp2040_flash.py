@@ -7,8 +7,8 @@ import threading
 import pytest
 from rp2040 import files, transport
 from typer.testing import CliRunner
-from upright import cli, device, flash, packages, paths, runtimes
-from upright import rp2040 as firmware
+from upright_host import cli, device, emulated, flash, packages, paths, runtimes
+from upright_host import rp2040 as firmware
 
 pytestmark = [pytest.mark.xdist_group("rp2040_flash"), pytest.mark.slow, pytest.mark.timeout(1800)]
 
@@ -45,7 +45,7 @@ def keep(tmp_path_factory):
     """Where the emulated board's flash is, instead of the cache."""
     path = tmp_path_factory.mktemp("emulated") / "pico.flash"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(device, "emulated_flash", lambda: path)
+        patch.setattr(emulated, "flash_file", lambda: path)
         yield path
 
 
@@ -57,7 +57,7 @@ def new():
 @pytest.fixture(scope="module")
 def old(new):
     """An older installation: one module is another, one is missing, one is there as its source."""
-    older = new | {"config.mpy": OLD_CONFIG, "lib/ssd1306.py": b"raise OSError"}
+    older = new | {"config.mpy": OLD_CONFIG, "lib/upright/ssd1306.py": b"raise OSError"}
     del older["filters.mpy"]
     return older
 
@@ -142,7 +142,9 @@ def test_mip_installs_a_package_from_an_index_and_it_can_be_imported(image, tmp_
         mip._install_package(board, "auxiliary_bus", index, "lib", None, True)
         server.shutdown()
     found = board.board.flash()
-    assert found == {"lib/auxiliary_bus.py": (paths.LIB / "auxiliary_bus.py").read_bytes()}
+    assert found == {
+        "lib/upright/auxiliary_bus.py": (paths.PACKAGE / "auxiliary_bus.py").read_bytes()
+    }
     board.exec("import auxiliary_bus")
-    assert board.eval("auxiliary_bus.__file__") == "/lib/auxiliary_bus.py"
+    assert board.eval("auxiliary_bus.__file__") == "/lib/upright/auxiliary_bus.py"
     assert board.eval("auxiliary_bus.AuxiliaryBus.__name__") == "AuxiliaryBus"

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 from typer.testing import CliRunner
-from upright import cli, debian, paths, runtimes
+from upright_host import cli, debian, paths, runtimes
 
 
 @pytest.fixture
@@ -18,7 +18,8 @@ def fresh(monkeypatch):
 def test_a_script_gets_its_arguments_and_the_boards_modules(runtime, tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
-        "import sys, machine, mahony, app\nprint(sys.argv[1:], sys.implementation.name)\nsys.exit(7)\n"
+        "import sys, machine\nfrom upright import mahony\nfrom upright_app import app\n"
+        "print(sys.argv[1:], sys.implementation.name)\nsys.exit(7)\n"
     )
     done = runtimes.run(runtime, script, ["a", "b c"])
     assert done.returncode == 7, done.stderr
@@ -89,7 +90,7 @@ def test_the_command_lists_every_runtime_with_a_version_or_a_reason():
 def test_exec_runs_a_file_and_passes_its_status_on(tmp_path):
     script = tmp_path / "script.py"
     script.write_text("import sys\nprint('hello', sys.argv[1])\nsys.exit(3)\n")
-    upright = [sys.executable, "-m", "upright.cli", "exec", "--runtime", "cpython"]
+    upright = [sys.executable, "-m", "upright_host.cli", "exec", "--runtime", "cpython"]
     done = subprocess.run([*upright, script, "-x"], capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (3, "hello -x\n")
     done = subprocess.run([*upright, tmp_path / "absent.py"], capture_output=True, text=True)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import typer
 from typer.testing import CliRunner
-from upright import baselines, score, scoring, trials
+from upright_host import baselines, score, scoring, trials
 
 RATE, SECONDS, EVERY = 100, 3, 4
 TURN = math.radians(-40)  # the sensor's heading: x is 40 deg east of north

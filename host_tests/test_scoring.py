@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from upright import scoring
+from upright_host import scoring
 
 Z, X = np.array([0.0, 0, 1]), np.array([1.0, 0, 0])
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from reference import mahony_float
 from reference.mahony_float import Mahony9Float, MahonyFloat, angle_between
-from upright import paths
+from upright_host import paths
 
 PAGES = [paths.ROOT / "docs" / name for name in ("methods.md", "methods.zh.md")]
 DEGREE = math.pi / 180

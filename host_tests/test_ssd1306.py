@@ -5,13 +5,13 @@ from decimal import ROUND_HALF_UP, Decimal
 
 import machine
 import pytest
-import ssd1306
 from chips.ssd1306 import SSD1306Chip
 from conftest import require
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from ssd1306 import BLACK, INVERSE, LARGE, OPAQUE, SMALL, TALL, WHITE, XOR
-from upright import oled
+from upright import ssd1306
+from upright.ssd1306 import BLACK, INVERSE, LARGE, OPAQUE, SMALL, TALL, WHITE, XOR
+from upright_host import oled
 
 QUICK = settings(max_examples=150, deadline=None)
 COLOURS = st.sampled_from((BLACK, WHITE, XOR))
@@ -570,7 +570,7 @@ def interrupt_after(count, d):
         return line
 
     def call(frame, event, argument):
-        return line if "ssd1306" in frame.f_code.co_filename else None
+        return line if frame.f_code.co_filename.endswith(("ssd1306.py", "canvas.py")) else None
 
     sys.settrace(call)
     try:

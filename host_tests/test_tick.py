@@ -4,7 +4,7 @@ from array import array
 
 import kernel
 import pytest
-from tick import FOLLOW_CHIP, Tick
+from upright.tick import FOLLOW_CHIP, Tick
 
 PERIOD = 5000
 

@@ -4,7 +4,7 @@ import types
 
 import machine
 import pytest
-import timing
+from upright import timing
 
 
 class FakeTimer:

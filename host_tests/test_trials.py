@@ -11,7 +11,7 @@ import pytest
 import world
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from upright import scoring, trials
+from upright_host import scoring, trials
 
 N, EVERY = 43, 4
 HEADER = {

@@ -9,7 +9,7 @@ import pytest
 import typer
 from test_compare import figures, line_of, save  # noqa: F401 (figures: a fixture)
 from typer.testing import CliRunner
-from upright import kalman_scan, plotting, trials, tune
+from upright_host import kalman_scan, plotting, trials, tune
 
 HZ = 100.0
 

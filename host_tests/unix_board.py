@@ -5,7 +5,7 @@ import json
 import subprocess
 
 from mpremote.transport import Transport, TransportExecError
-from upright import runtimes
+from upright_host import runtimes
 
 # Runs a line of JSON (the code) in one namespace; the answer: a line of JSON [output, error or null]
 _SERVER = """

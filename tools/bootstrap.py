@@ -34,7 +34,7 @@ def stamp():
 def pip_wheel(folder):
     """-> pip's wheel out of Debian's package."""
     sys.path.insert(0, str(ROOT / "tools"))
-    from upright.debian import Apt, AptError
+    from upright_host.debian import Apt, AptError
 
     print(
         "setup: no ensurepip here (python3-venv is not installed): fetching pip's wheel from Debian"

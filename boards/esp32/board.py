@@ -1,10 +1,9 @@
 # ESP32 (DevKitC and alike): its timers call back in the main program's time only; see README.md for the wiring.
-# What can be set besides is in firmware/config.py.
+# What can be set besides is in lib/upright/settings.py.
 
-import ssd1306
-import timing
 from machine import I2C, Pin
-from mpu6050 import MPU6050
+from upright import ssd1306, timing
+from upright.mpu6050 import MPU6050
 
 NAME = "ESP32"
 PLATFORM = "esp32"  # sys.platform there

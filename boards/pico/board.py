@@ -1,10 +1,9 @@
 # Raspberry Pi Pico (RP2040), MicroPython 1.26 or newer for hard timer interrupts; see README.md for the wiring.
-# What can be set besides is in firmware/config.py.
+# What can be set besides is in lib/upright/settings.py.
 
-import ssd1306
-import timing
 from machine import I2C, Pin
-from mpu6050 import MPU6050
+from upright import ssd1306, timing
+from upright.mpu6050 import MPU6050
 
 NAME = "Raspberry Pi Pico"
 PLATFORM = "rp2"  # sys.platform there

@@ -1,14 +1,13 @@
 # RoboMaster development board A (STM32F427IIH6): MPU6500 on SPI5, IST8310 on its auxiliary bus, OLED on SPI1.
-# Everything is on the board but the OLED; see README.md. What can be set besides is in firmware/config.py.
+# Everything is on the board but the OLED; see README.md. What can be set besides is in lib/upright/settings.py.
 
 import time
 
-import ssd1306
-import timing
-from auxiliary_bus import AuxiliaryBus
-from ist8310 import IST8310
 from machine import SPI, Pin
-from mpu6500 import MPU6500
+from upright import ssd1306, timing
+from upright.auxiliary_bus import AuxiliaryBus
+from upright.ist8310 import IST8310
+from upright.mpu6500 import MPU6500
 
 NAME = "RoboMaster board A"
 PLATFORM = "pyboard"  # sys.platform there

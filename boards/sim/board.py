@@ -1,10 +1,9 @@
 # The simulated board that `upright demo` and the tests boot: wired like the Pico of boards/pico.
-# What can be set besides is in firmware/config.py.
+# What can be set besides is in lib/upright/settings.py.
 
-import ssd1306
-import timing
 from machine import I2C, Pin
-from mpu6050 import MPU6050
+from upright import ssd1306, timing
+from upright.mpu6050 import MPU6050
 
 NAME = "simulated board"
 SENSOR_RATE_HZ = 1000

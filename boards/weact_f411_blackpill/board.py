@@ -1,10 +1,9 @@
 # WeAct Black Pill (STM32F411CE), MicroPython's WEACT_F411_BLACKPILL; see README.md for the wiring.
-# What can be set besides is in firmware/config.py.
+# What can be set besides is in lib/upright/settings.py.
 
-import ssd1306
-import timing
 from machine import I2C, Pin
-from mpu6050 import MPU6050
+from upright import ssd1306, timing
+from upright.mpu6050 import MPU6050
 
 NAME = "WeAct F411 Black Pill"
 PLATFORM = "pyboard"  # sys.platform there

@@ -3,16 +3,16 @@
 #                       everywhere
 #   alloc [float]       10,000 calls with the heap locked, then with the allocated bytes counted; float: in a twin that
 #                       allocates
-#   record WORLD OUT S  firmware/record.py on the simulated board, S seconds
+#   record WORLD OUT S  firmware/upright_app/record.py on the simulated board, S seconds
 
 import gc
 import sys
 from array import array
 from binascii import crc32
 
-import calibration
 import micropython
-from calibration import Calibration, CalibrationError
+from upright import calibration
+from upright.calibration import Calibration, CalibrationError
 
 AXES = (("x", "y", "z"), ("y", "-x", "z"), ("-z", "-y", "-x"), ("+z", "x", "y"))
 MIRROR = ("x", "y", "-z")
@@ -129,7 +129,7 @@ def record():
     world = World(sys.argv[2])
     world.start(kernel.now())
     machine.wire_i2c(0, MPU6050Chip(world))
-    import record
+    from upright_app import record
 
     print(record.run(sys.argv[3], int(sys.argv[4])))
 

@@ -3,8 +3,8 @@
 from array import array
 
 import micropython
-from mpu6050 import MPU6050
-from mpu_dmp import MpuDmp
+from upright.dmp import MpuDmp
+from upright.mpu6050 import MPU6050
 
 IMAGES = (bytes(3062), bytes(1929))
 

@@ -5,9 +5,9 @@ import kernel
 import machine
 from chips.mpu6050 import MPU6050Chip
 from chips.mpu6500 import MPU6500Chip
-from mpu6050 import MPU6050
-from mpu6500 import MPU6500
-from mpu_dmp import MpuDmp, MpuDmpError
+from upright.dmp import MpuDmp, MpuDmpError
+from upright.mpu6050 import MPU6050
+from upright.mpu6500 import MPU6500
 from world import StillWorld
 
 PATCHES = bytes((3, 0x7B, 3, 1, 2, 3, 0, 0, 0, 1, 7, 0x86, 1, 0xFE))

@@ -7,8 +7,8 @@ import sys
 from array import array
 
 import allocation
-from complementary import Euler6
-from kalman import Kalman6, KalmanFilter
+from upright.complementary import Euler6
+from upright.kalman import Kalman6, KalmanFilter
 
 waste = sys.argv[1] if len(sys.argv) > 1 else ""
 

@@ -10,7 +10,7 @@ from world import WORDS, World
 
 path, out, module, kind, gains = sys.argv[1:6]
 world = World(path)
-kind = getattr(__import__(module), kind)
+kind = getattr(__import__("upright." + module, None, None, (kind,)), kind)
 filter = kind(world.rate, world.gyro_scale, world.accel_lsb_per_g, **json.loads(gains))
 if len(sys.argv) > 6:
     filter.set_bias(int(sys.argv[6]), int(sys.argv[7]), int(sys.argv[8]))

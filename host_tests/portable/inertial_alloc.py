@@ -7,7 +7,7 @@ import sys
 from array import array
 
 import micropython
-from inertial_mahony import Inertial6, Inertial9, Inertial9Lite
+from upright.inertial import Inertial6, Inertial9, Inertial9Lite
 
 UPDATES = 10000
 waste = sys.argv[1] if len(sys.argv) > 1 else ""

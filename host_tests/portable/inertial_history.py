@@ -6,7 +6,7 @@
 import sys
 from array import array
 
-from inertial_mahony import InertialMahony
+from upright.inertial import InertialMahony
 from world import WORDS, World
 
 path, out, axes, lite, mag_every = sys.argv[1:6]

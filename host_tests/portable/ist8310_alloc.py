@@ -10,9 +10,9 @@ from array import array
 sys.path.append(__file__.rsplit("/", 1)[0] if "/" in __file__ else ".")
 
 from allocation import borrowed, grown, locked
-from auxiliary_bus import AUX_BUSY, AUX_DONE, AUX_NACK, AUX_TIMEOUT, AuxiliaryBus
-from ist8310 import IST8310, IST8310_I2C
-from mpu6050 import MPU6050
+from upright.auxiliary_bus import AUX_BUSY, AUX_DONE, AUX_NACK, AUX_TIMEOUT, AuxiliaryBus
+from upright.ist8310 import IST8310, IST8310_I2C
+from upright.mpu6050 import MPU6050
 
 TICKS = 2_000
 MAG = 0x0E

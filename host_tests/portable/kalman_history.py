@@ -1,7 +1,7 @@
 # What the Kalman filters compute, as text that is the same on every runtime: estimates and gains of scalar filters over
 # made-up measurements, and the gains that set-up finds for the attitude filter.
 
-from kalman import Kalman6, KalmanFilter
+from upright.kalman import Kalman6, KalmanFilter
 
 for q, r, turn in (
     (10.0, 0.05, 360000),

@@ -7,9 +7,9 @@ import gc
 import sys
 from array import array
 
-import fixmath
 import micropython
-from mahony import Mahony6, Mahony9
+from upright import fixmath
+from upright.mahony import Mahony6, Mahony9
 
 UPDATES = 10000
 waste = sys.argv[1] if len(sys.argv) > 1 else ""

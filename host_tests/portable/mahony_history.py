@@ -6,7 +6,7 @@
 import sys
 from array import array
 
-from mahony import Mahony6, Mahony9
+from upright.mahony import Mahony6, Mahony9
 from world import WORDS, World
 
 path, out, kp, ki = sys.argv[1:5]

@@ -9,7 +9,7 @@ import sys
 sys.path.append(__file__.rsplit("/", 1)[0] if "/" in __file__ else ".")
 
 from allocation import borrowed, grown, locked
-from mpu6050 import HEALTH_MISMATCH, HEALTH_REPAIRING, MPU6050
+from upright.mpu6050 import HEALTH_MISMATCH, HEALTH_REPAIRING, MPU6050
 
 TICKS = 10_000
 

@@ -9,7 +9,7 @@ import sys
 sys.path.append(__file__.rsplit("/", 1)[0] if "/" in __file__ else ".")
 
 from allocation import borrowed, grown, locked
-from mpu6500 import HEALTH_MISMATCH, HEALTH_REPAIRING, MPU6500
+from upright.mpu6500 import HEALTH_MISMATCH, HEALTH_REPAIRING, MPU6500
 
 TICKS = 4_000
 EXT = 7

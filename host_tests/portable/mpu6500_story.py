@@ -4,7 +4,7 @@
 import kernel
 import machine
 from chips.mpu6500 import MPU6500Chip
-from mpu6500 import MPU6500
+from upright.mpu6500 import MPU6500
 from world import StillWorld
 
 

@@ -4,9 +4,9 @@
 from array import array
 
 import machine
-import pages
-import ssd1306
 from chips.ssd1306 import SSD1306Chip
+from upright import ssd1306
+from upright_app import pages
 
 LEVEL = (0, 0, 0)
 

@@ -7,7 +7,7 @@ import sys
 from array import array
 
 import micropython
-from quaternion_kalman import QuaternionKalman6, QuaternionKalman9
+from upright.quaternion_kalman import QuaternionKalman6, QuaternionKalman9
 
 UPDATES = 10000
 waste = sys.argv[1] if len(sys.argv) > 1 else ""

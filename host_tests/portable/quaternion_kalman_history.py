@@ -7,7 +7,7 @@
 import sys
 from array import array
 
-from quaternion_kalman import QuaternionKalman
+from upright.quaternion_kalman import QuaternionKalman
 from world import WORDS, World
 
 path, out, axes, mag_every = sys.argv[1:5]

@@ -7,8 +7,8 @@ import sys
 from array import array
 
 import micropython
-import pages
-import ssd1306
+from upright import ssd1306
+from upright_app import pages
 
 STEPS = 10000
 twin = sys.argv[1] if len(sys.argv) > 1 else ""

@@ -10,14 +10,14 @@ import utime
 
 sys.modules["time"] = utime  # the built-in one, also where the simulator's is on the path
 
-import tick as ticks  # noqa: E402
-from auxiliary_bus import AuxiliaryBus  # noqa: E402
-from calibration import Calibration  # noqa: E402
-from ist8310 import IST8310  # noqa: E402
-from mahony import Mahony6, Mahony9  # noqa: E402
-from mpu6050 import MPU6050  # noqa: E402
-from mpu6500 import MPU6500  # noqa: E402
-from ssd1306 import SSD1306_I2C  # noqa: E402
+from upright import tick as ticks  # noqa: E402
+from upright.auxiliary_bus import AuxiliaryBus  # noqa: E402
+from upright.calibration import Calibration  # noqa: E402
+from upright.ist8310 import IST8310  # noqa: E402
+from upright.mahony import Mahony6, Mahony9  # noqa: E402
+from upright.mpu6050 import MPU6050  # noqa: E402
+from upright.mpu6500 import MPU6500  # noqa: E402
+from upright.ssd1306 import SSD1306_I2C  # noqa: E402
 
 TICKS = 10000
 

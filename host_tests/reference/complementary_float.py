@@ -1,4 +1,4 @@
-"""The Euler-angle method in double-precision floats: what lib/complementary.py is measured against.
+"""The Euler-angle method in double-precision floats: what lib/upright/complementary.py is measured against.
 
 Plain Python without numpy; runs on CPython. It takes the integer filter's gains as they were quantised, and the same
 decisions (flags, the least norm, the bounds at the pole), so that a comparison measures arithmetic alone.
@@ -39,7 +39,7 @@ class EulerFloat:
     @classmethod
     def like(cls, integer, **kw):
         """The twin of a complementary.Euler6: its quantised gains, its bias, its angles."""
-        import complementary as c
+        from upright import complementary as c
 
         s = integer.state
         unit = 2 * math.pi / 2**30

@@ -1,4 +1,4 @@
-"""The inertial-frame Mahony filter in double-precision floats: what lib/inertial_mahony.py is measured against.
+"""The inertial-frame Mahony filter in double-precision floats: what lib/upright/inertial.py is measured against.
 
 Plain Python without numpy; runs on CPython. Same schedule and same order of work as the integer filter (what runs every
 step, what every BLOCK steps), but physical units, true roots and angles, and no rounding. Yes/no decisions are taken
@@ -7,7 +7,7 @@ here, or copied from the integer run (`update(counts, decisions)`), so that a co
 
 import math
 
-# decisions, as lib/inertial_mahony.py has them in its state
+# decisions, as lib/upright/inertial.py has them in its state
 STILL = 1  # gyro and accelerometer near their averages in this block
 NEAR_REFERENCE = 2  # field near the reference
 NEAR_CANDIDATE = 4  # field near the candidate for a new reference

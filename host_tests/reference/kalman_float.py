@@ -1,4 +1,4 @@
-"""Kalman filters of angles in double-precision floats: what lib/kalman.py is measured against. Runs on CPython."""
+"""Kalman filters of angles in double-precision floats: what lib/upright/kalman.py is measured against."""
 
 import math
 
@@ -15,7 +15,7 @@ class KalmanFloat(EulerFloat):
 
     @classmethod
     def like(cls, integer, **kw):
-        import kalman as k
+        from upright import kalman as k
 
         twin = super().like(integer, **kw)
         s = integer.state

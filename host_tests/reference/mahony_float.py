@@ -1,4 +1,4 @@
-"""Mahony's filter in double-precision floats: what lib/mahony.py is measured against.
+"""Mahony's filter in double-precision floats: what lib/upright/mahony.py is measured against.
 
 Plain Python without numpy; runs on CPython. It takes the integer filter's gains as they were
 quantised, and the same decisions (flags, the least norms, the integral's limit, the steps that a
@@ -72,7 +72,7 @@ class MahonyFloat:
     @classmethod
     def like(cls, integer, **kw):
         """The twin of a mahony.Mahony6: its quantised gains, its bias, its attitude."""
-        import mahony
+        from upright import mahony
 
         s = integer.state
         num, den = integer.rate
@@ -164,7 +164,7 @@ class Mahony9Float(MahonyFloat):
 
     @classmethod
     def like(cls, integer, **kw):
-        import mahony
+        from upright import mahony
 
         twin = super().like(integer, **kw)
         twin.mag_most = integer.state[mahony._MAG_MOST]

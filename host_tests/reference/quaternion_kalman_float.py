@@ -1,4 +1,4 @@
-"""The quaternion Kalman filter in double-precision floats: what lib/quaternion_kalman.py is measured against.
+"""The quaternion Kalman filter in double-precision floats: what lib/upright/quaternion_kalman.py is measured against.
 
 Needs numpy; runs on CPython. The same model, schedule and order of work as the integer filter, but physical units, full
 matrices, true roots and angles, and no rounding. Yes/no decisions are taken here, or copied from the integer run
@@ -11,7 +11,7 @@ import numpy as np
 
 from reference.inertial_float import block_of, clamp, rows, turned
 
-# decisions, as lib/quaternion_kalman.py has them in its state
+# decisions, as lib/upright/quaternion_kalman.py has them in its state
 STILL = 1  # gyro and accelerometer near their averages in this block
 NEAR = 2  # the field is near its reference
 FAR = 4  # heading error beyond what a good field explains

@@ -1,0 +1,1 @@
+# The application that a board boots: see app.py.

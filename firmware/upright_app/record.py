@@ -1,0 +1,176 @@
+# Records raw counts into a file for `upright calibrate`: import record; record.run("tumble.imu", seconds=60)
+# Needs the files of lib/ and a board.py. Every port; takes the place of the application while it runs.
+
+import json
+import os
+import time
+from array import array
+
+from micropython import const
+from upright import settings as config
+
+_WORDS = const(11)
+_BLOCK = const(64)  # rows that are written at once: 1408 bytes
+_SPARE = const(8192)  # bytes of the file system that are left alone
+_SILENT_US = const(2000000)
+
+
+def run(path="recording.imu", seconds=60, rate_hz=100, board=None):
+    """Write the counts of `seconds` to `path`, in the chips' own frames; Ctrl-C ends it earlier.
+
+    rate_hz  of the chip, and of the rows; 100 Hz is what a board's flash takes. Rows that were
+             missed while the flash was being written are in the file as not fresh.
+    board    the board's module; None: board.py
+
+    Returns the number of rows. Raises the driver's error when there is no sensor, OSError when the
+    file cannot be written or is too large for the file system.
+    """
+    if board is None:
+        import board
+    _stop_application()
+    imu, mag = _open(board, rate_hz)
+    num, den = imu.sample_rate
+    rows = max(1, seconds * num // den)
+    free = _free(path)
+    if free is not None and rows * 2 * _WORDS > free:
+        raise OSError(
+            "%d s take %d bytes, %d are free: fewer seconds, or a lower rate_hz"
+            % (seconds, rows * 2 * _WORDS, free)
+        )
+    print("recording %d s at %d/%d Hz; Ctrl-C ends it" % (seconds, num, den))
+    with open(path, "wb") as file:
+        recorder = _Recorder(file, _header(board, imu, mag, path), rows)
+        try:
+            recorder.record(imu, mag, num, den)
+            print("done")
+        except KeyboardInterrupt:
+            print("ended")
+        finally:
+            recorder.finish()
+    n = recorder.n
+    print("%s: %d rows, %d of them missed" % (path, n, recorder.lost))
+    print("fetch it:  mpremote cp :%s ." % path)
+    print("then:      upright calibrate mag (or gyro, accel) %s" % path[path.rfind("/") + 1 :])
+    return n
+
+
+class _Recorder:
+    """Rows into a file, in blocks. n: rows so far; lost: those of them that are not fresh."""
+
+    def __init__(self, file, header, rows):
+        self._file = file
+        self._header = header
+        self._rows = rows
+        self._block = array("h", [0] * (_WORDS * _BLOCK))
+        self._written = 0
+        self.n = self.lost = 0
+        file.write(header % rows)
+
+    def record(self, imu, mag, num, den):
+        period = 1000000 * den // num
+        counts = imu.counts
+        # Between twice and three times a sample: the phase wanders, so that it never stays where a read falls between a
+        # sample and what the auxiliary bus brings to it, which would cost magnetometer samples
+        step = period * 4 // 9
+        last = due = time.ticks_us()
+        while self.n < self._rows:
+            flags = imu.read()
+            now = time.ticks_us()
+            passed = time.ticks_diff(now, last)
+            if flags & 1:
+                # one that is read by itself has its sample with one of the IMU's
+                if mag is not None and hasattr(mag, "read"):
+                    mag.read(counts)
+                missed = (passed + period // 2) // period - 1 if self.n else 0
+                while missed > 0 and self.n < self._rows - 1:
+                    self._row(counts, 0)
+                    self.lost += 1
+                    missed -= 1
+                self._row(counts, counts[10])
+                last = now
+            elif passed > _SILENT_US:
+                raise OSError("no sample for %d s" % (_SILENT_US // 1000000))
+            imu.health()
+            due = time.ticks_add(due, step)
+            early = time.ticks_diff(due, time.ticks_us())
+            if early > 0:
+                time.sleep_us(early)
+            else:
+                due = time.ticks_us()
+
+    def _row(self, counts, flags):
+        at = (self.n - self._written) * _WORDS
+        for i in range(10):
+            self._block[at + i] = counts[i]
+        self._block[at + 10] = flags
+        self.n += 1
+        if self.n - self._written == _BLOCK:
+            self._file.write(self._block)
+            self._written = self.n
+
+    def finish(self):
+        """The last rows, and their number where it is not the one that the header was begun with."""
+        # A Ctrl-C may have come between a block and its being counted: it is written again, in its place
+        self._file.seek(len(self._header % self._rows) + self._written * 2 * _WORDS)
+        self._file.write(memoryview(self._block)[: (self.n - self._written) * _WORDS])
+        if self.n != self._rows:
+            self._file.seek(0)
+            self._file.write(self._header % self.n)
+
+
+def _open(board, rate_hz):
+    settings = config.Config(board)
+    imu = board.sensor()
+    # no dlpf: the filter follows the rate, so that nothing aliases
+    imu.configure(settings.ACCEL_RANGE_G, settings.GYRO_RANGE_DPS, sample_rate_hz=rate_hz)
+    print("sensor: %s, %d/%d Hz" % ((imu.chip,) + imu.sample_rate))
+    if not hasattr(board, "magnetometer"):
+        return imu, None
+    mag = board.magnetometer(imu)
+    try:
+        mag.configure(rate_hz=min(settings.MAG_RATE_HZ, rate_hz), sample_rate=imu.sample_rate)
+        print("magnetometer: %s, %d/%d Hz" % ((mag.chip,) + mag.sample_rate))
+        return imu, mag
+    except OSError as why:
+        print("magnetometer: %s; recording without it" % why)
+        return imu, None
+
+
+def _header(board, imu, mag, path):
+    """The first line of an .imu file, with a place of 8 digits for the number of rows."""
+    fields = {
+        "format": "upright-imu",
+        "version": 1,
+        "name": path,
+        "rate": imu.sample_rate,
+        "accel_lsb_per_g": imu.accel_lsb_per_g,
+        "gyro_scale": imu.gyro_scale,
+        "clocked": True,
+        "chip": imu.chip,
+        "board": board.NAME,
+    }
+    if mag is not None:
+        fields["mag_lsb_per_uT"] = mag.lsb_per_uT
+    line = json.dumps(fields).replace("%", "%%").encode()
+    return line[:-1] + b', "rows": %8d}\n'
+
+
+def _free(path):
+    """Bytes that may be written, or None where the port does not say."""
+    if not hasattr(os, "statvfs"):
+        return None
+    found = os.statvfs(path[: path.rfind("/") + 1] or ".")
+    return found[0] * found[3] - _SPARE
+
+
+def _stop_application():
+    """Stop the ticks of an application that was left by Ctrl-C: they would go on using the bus."""
+    try:
+        import __main__
+    except ImportError:
+        return
+    application = getattr(__main__, "application", None)
+    for name in ("ticker", "guard"):
+        ticker = getattr(application, name, None)
+        if ticker is not None:
+            ticker.stop()

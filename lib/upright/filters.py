@@ -1,0 +1,64 @@
+# The filters that the firmware and the host tools can choose from, by name. Every port.
+
+# name: (module, class) of lib/; a module is imported when one of its filters is made, so that the others take no memory
+FILTERS = {
+    "mahony6": ("mahony", "Mahony6"),
+    "mahony9": ("mahony", "Mahony9"),
+    "inertial6": ("inertial", "Inertial6"),
+    "inertial9": ("inertial", "Inertial9"),
+    "inertial9-lite": ("inertial", "Inertial9Lite"),
+    "euler6": ("complementary", "Euler6"),
+    "kalman6": ("kalman", "Kalman6"),
+    "quaternion-kalman6": ("quaternion_kalman", "QuaternionKalman6"),
+    "quaternion-kalman9": ("quaternion_kalman", "QuaternionKalman9"),
+    "dmp6": ("dmp", "MpuDmp"),
+}
+
+# These are computed by the sensor itself: driver and filter are one object, so no samples can be handed to them.
+HARDWARE = ("dmp6",)
+
+
+def check(name):
+    """Raise ValueError for a name that no filter has."""
+    if name not in FILTERS:
+        raise ValueError("unknown filter %r; there are %s" % (name, ", ".join(sorted(FILTERS))))
+
+
+def make(name, rate, imu, gains):
+    """Build a filter by its name for samples of `imu` (its scales) at `rate` (Hz, or (num, den) Hz).
+
+    gains: dict of the filter's own keyword arguments, {} for its defaults. Raises ValueError for an unknown name, and
+    for what the filter does not take.
+    """
+    check(name)
+    if name in HARDWARE:
+        raise ValueError("%s is computed in the sensor: no samples can be handed to it" % name)
+    kind = _class(name)
+    try:
+        return kind(rate, imu.gyro_scale, imu.accel_lsb_per_g, **gains)
+    except TypeError as why:
+        raise ValueError("%s with %r: %s" % (name, gains, why))
+
+
+def make_hardware(name, imu, config):
+    """Build a filter of HARDWARE on the driver `imu`, by config's RATE, DMP_IMAGE, DMP_SHA256 and IMU_AXES.
+
+    It takes the place of the driver, and it is the filter. Raises OSError for an image that is absent or not the one
+    that is known, ValueError for settings that it cannot keep.
+    """
+    num, den = config.RATE
+    if num % den or config.DRIVE != "timer":
+        raise ValueError('with %s DRIVE is "timer" and RATE a whole number' % name)
+    more = {"known": (config.DMP_SHA256,)} if config.DMP_SHA256 else {}
+    return _class(name)(imu, config.DMP_IMAGE, num // den, axes=config.IMU_AXES, **more)
+
+
+def _class(name):
+    module, kind = FILTERS[name]
+    try:
+        return getattr(__import__("upright." + module, None, None, (kind,)), kind)
+    except ImportError:
+        raise ValueError(
+            "%s.py is not on this board: install the firmware again with FILTER = %r"
+            % (module, name)
+        )

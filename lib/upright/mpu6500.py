@@ -1,0 +1,236 @@
+# Driver of the InvenSense MPU6500 on SPI, and of its family (MPU9250, ICM-20689 ...); on I2C as well.
+# Needs an SPI object and a chip select pin, mpu_common.py, mpu_parts.py, mpu6050.py. Runs on MicroPython
+# >= 1.22 and under CPython with a `micropython` shim. PS is PS-MPU-6500A rev 1.3, RM RM-MPU-6500A rev 2.1.
+
+import time
+
+import micropython
+from micropython import const
+
+from upright import mpu_parts
+from upright.mpu6050 import MPU6050
+from upright.mpu_common import (  # noqa: F401  the health states are part of this module's face
+    HEALTH_BUS_ERROR,
+    HEALTH_MISMATCH,
+    HEALTH_OK,
+    HEALTH_REPAIRING,
+    MpuBase,
+)
+
+_INT_STATUS = const(0x3A)
+_EXT_SENS_DATA_23 = const(0x60)
+_SIGNAL_PATH_RESET = const(0x68)
+_USER_CTRL = const(0x6A)
+_WHO_AM_I = const(0x75)
+
+_I2C_IF_DIS = const(0x10)
+_READ = const(0x80)  # first bit of the address byte, PS 7.5
+_IDLE = const(0xFF)  # sent while reading: should the chip take it for an address, it is a read
+_REGISTER_HZ = const(1_000_000)  # PS 6.5: every register
+_SENSOR_HZ = const(20_000_000)  # PS 6.5: reading sensor and interrupt registers
+
+
+class MPU6500Error(OSError):
+    """The chip is absent, another one, or does not keep what is written to it; at set-up only."""
+
+
+class MPU6500(MpuBase):
+    """An MPU6500 on an SPI bus of its own, in mode 0 or 3.
+
+    spi             has write, readinto and, to be clocked as below, init(baudrate=); a machine.SPI
+    cs              chip select, an output pin, called with 0 and 1
+    accept_unknown  take a part whose identity is not in the table for an MPU6500
+    fast_hz         clock for sensor bursts, at most 20 MHz (PS 6.5)
+    slow_hz         clock for everything else, at most 1 MHz (PS 6.5)
+
+    Where the bus cannot be set to another clock without allocating memory, or takes longer for it than
+    it saves, everything runs at slow_hz; where it cannot be set at all, at the clock that it was made
+    with, which must then be 1 MHz or less. burst_hz says what came of it (0: as made).
+
+    Constructing touches no bus. configure() finds, resets and starts the chip (0.3 s); then, in a
+    timer's or a pin's interrupt, read() fills counts (ax ay az gx gy gz mx my mz temp flags), health()
+    looks after the configuration, and fifo_poll() with fifo_next() take the place of read() in FIFO
+    mode:
+
+        imu = MPU6500(machine.SPI(5, 1_000_000), machine.Pin("PF6", machine.Pin.OUT, value=1))
+        imu.configure(accel_range_g=8, gyro_range_dps=2000, sample_rate_hz=1000)
+
+        def tick(timer):
+            if imu.read() & 1:
+                ...  # a new sample in imu.counts
+            imu.health()
+
+    Counters, wrapping at 2**30: errors (what nobody drove on the bus; SPI has no acknowledge), stale
+    (read() found nothing new), resets (of the chip by itself), fifo_overflows, fifo_resets, fifo_lost
+    (packets, as far as they could be counted). chip is the part's name, who_am_i its identity.
+    """
+
+    error_class = MPU6500Error
+    _INTERFACE = _I2C_IF_DIS  # or a glitch on CS makes the chip an I2C slave
+
+    def __init__(self, spi, cs, accept_unknown=False, fast_hz=10_000_000, slow_hz=_REGISTER_HZ):
+        if not 0 < slow_hz <= _REGISTER_HZ:
+            raise ValueError(f"slow_hz {slow_hz!r} is not 1 to {_REGISTER_HZ}")
+        if not slow_hz <= fast_hz <= _SENSOR_HZ:
+            raise ValueError(f"fast_hz {fast_hz!r} is not {slow_hz} to {_SENSOR_HZ}")
+        MpuBase.__init__(self)
+        self._spi = spi
+        self._cs = cs
+        self._accept_unknown = accept_unknown
+        self._slow_hz = slow_hz
+        self._fast_hz = fast_hz
+        self.burst_hz = 0  # while 0 the clock is left alone
+        self._hz = 0  # what the bus runs at
+        self._head = bytearray(1)
+        self._out = bytearray(2)
+
+    # The bus, in the tick too
+
+    @micropython.native
+    def _read_into(self, register, buffer):
+        n = len(buffer)
+        # for a byte or two another clock does not pay; FIFO_R_W is no sensor register
+        hz = self._slow_hz
+        if n > 2 and register >= _INT_STATUS and register + n <= _EXT_SENS_DATA_23 + 1:
+            hz = self.burst_hz
+        if hz != self._hz:
+            self._clock(hz)
+        self._head[0] = register | _READ
+        try:
+            self._cs(0)
+            self._spi.write(self._head)
+            self._spi.readinto(buffer, _IDLE)
+        finally:
+            self._cs(1)
+
+    @micropython.native
+    def _write(self, register, value):
+        if self._hz != self._slow_hz:
+            self._clock(self._slow_hz)
+        out = self._out
+        out[0] = register
+        out[1] = value
+        try:
+            self._cs(0)
+            self._spi.write(out)
+        finally:
+            self._cs(1)
+
+    def _write_from(self, buffer):
+        """A burst: buffer[0] is the register, the others go into it and the next ones."""
+        if self._hz != self._slow_hz:
+            self._clock(self._slow_hz)
+        try:
+            self._cs(0)
+            self._spi.write(buffer)
+        finally:
+            self._cs(1)
+
+    # What machine.SPI.init(baudrate=) does, by the ports' sources: stm32 (machine_spi.c, spi.c) leaves
+    # polarity and phase alone and takes the next lower power-of-two part of the peripheral's clock
+    # (84 MHz: 656 kHz for 1 MHz, 5.25 MHz for 10 MHz, 10.5 MHz for 20 MHz); it sets up pins and
+    # peripheral anew and so lets go of SCK for a moment, hence only while CS is high. rp2 sets nothing
+    # but the divider, again to the next lower rate. Neither allocates. esp32 tears the whole bus down.
+
+    @micropython.native
+    def _clock(self, hz):
+        if self.burst_hz:
+            self._hz = 0  # unknown, should it fail
+            self._spi.init(baudrate=hz)
+            self._hz = hz
+
+    def _find_clocks(self):
+        """Decide whether sensor bursts get a clock of their own."""
+        self.burst_hz = self._hz = 0
+        try:
+            self._spi.init(baudrate=self._slow_hz)
+        except Exception:  # whatever a port raises where it has no such method or argument
+            return
+        taken = self._try_clocks()
+        # a burst of 16 bytes must gain more than the way there and back costs
+        gain = 128_000_000 // self._slow_hz - 128_000_000 // self._fast_hz
+        if 0 <= taken <= gain:
+            self.burst_hz = self._fast_hz
+            self._hz = self._slow_hz
+        else:
+            self._spi.init(baudrate=self._slow_hz)
+            self.burst_hz = self._slow_hz
+            self._hz = self._slow_hz
+
+    def _try_clocks(self):
+        """Microseconds for fast and back to slow without a heap, -1 if that cannot be."""
+        spi = self._spi
+        fast, slow = self._fast_hz, self._slow_hz
+        now = time.ticks_us
+        begun = ended = 0
+        possible = True
+        micropython.heap_lock()
+        try:
+            spi.init(baudrate=fast)
+            spi.init(baudrate=slow)
+            begun = now()
+            spi.init(baudrate=fast)
+            spi.init(baudrate=slow)
+            ended = now()
+        except Exception:
+            possible = False
+        finally:
+            micropython.heap_unlock()
+        return time.ticks_diff(ended, begun) if possible else -1
+
+    # Set-up
+
+    def _begin(self):
+        self._cs(1)
+        self._find_clocks()
+        self._identify()
+        # RM 4.28: over SPI both H_RESET and SIGNAL_PATH_RESET, each followed by 100 ms
+        self._reset("on SPI")
+        self._set_up_write(_USER_CTRL, _I2C_IF_DIS)
+        self._set_up_write(_SIGNAL_PATH_RESET, 0x07)
+        time.sleep_ms(100)
+        self._identify()
+
+    def _identify(self):
+        who = 0
+        for _ in range(11):
+            try:
+                self._read_into(_WHO_AM_I, self._one)
+                who = self._one[0]
+            except OSError:
+                pass
+            if who not in (0x00, 0xFF):
+                break
+            time.sleep_ms(10)  # just powered up, the chip may take 100 ms to answer (PS 6.3)
+        else:
+            raise MPU6500Error(
+                f"no MPU6500 on SPI: WHO_AM_I (0x75) reads 0x{who:02x}, as nobody drives it (11 reads "
+                "in 0.1 s). Check supply, the pin of CS, MISO (AD0/SDO of the chip), SCK, and that "
+                "the bus is in mode 0 or 3"
+            )
+        part = mpu_parts.PARTS.get(who)
+        if part is None:
+            if not self._accept_unknown:
+                known = ", ".join(f"0x{k:02x}" for k in sorted(mpu_parts.PARTS))
+                raise MPU6500Error(
+                    f"WHO_AM_I (0x75) reads 0x{who:02x} on SPI; known are {known}. A bus in mode 1 or "
+                    "2 or over 1 MHz garbles it too. accept_unknown=True uses it as an MPU6500"
+                )
+            part = (f"unknown (0x{who:02x})",) + mpu_parts.PARTS[0x70][1:]
+        elif not part[1]:
+            raise MPU6500Error(
+                f"WHO_AM_I (0x75) reads 0x{who:02x} on SPI: an {part[0]}, which has no SPI, or an "
+                "MPU6000, which this driver does not know"
+            )
+        self._adopt(who, part)
+
+
+class MPU6500_I2C(MPU6050):
+    """An MPU6500, or another part of its family, on an I2C bus: MPU6050 that takes nothing else.
+
+    i2c, address, accept_unknown  as for MPU6050; an unknown part is taken for an MPU6500
+    """
+
+    error_class = MPU6500Error
+    _NAME = "MPU6500"
+    _ONLY_6500 = True

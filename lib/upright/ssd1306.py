@@ -1,0 +1,433 @@
+# Writer for SSD1306 and SH1106 OLED displays, I2C or SPI, that never allocates once it is set up.
+# Needs ssd1306_canvas.py and ssd1306_font.py beside it, viper, and a bus object with `writeto`
+# (I2C) or `write` (SPI); runs on boards, the unix port and, with the host shim, CPython. Section
+# numbers are those of the SSD1306 datasheet, rev 1.1; what differs on the SH1106 is from its own,
+# v2.3.
+
+import time
+from array import array
+
+import micropython
+from micropython import const
+
+from upright.canvas import (  # noqa: F401 (colours and sizes are part of this module)
+    BLACK,
+    INVERSE,
+    LARGE,
+    OPAQUE,
+    SMALL,
+    TALL,
+    WHITE,
+    XOR,
+    Canvas,
+)
+
+_BLOCK = const(8)  # columns of one page that are tracked and sent together
+_ATTEMPTS = const(8)  # failed transfers in a row after which a frame is given up
+_MOST_ERRORS = const(0x1FFFFFFF)  # the counters stop here: beyond 30 bits an int would be boxed
+
+
+class DisplayError(OSError):
+    """The display did not take its set-up: not there, or at another address."""
+
+
+@micropython.viper
+def _changes(fb, sent, dirty, stride: int, pages: int, everything: int) -> int:
+    """Copies the blocks that differ (or all) into `sent` and marks them in `dirty`; returns how
+    many.
+
+    A single clean block between two dirty ones is marked too: sending it is cheaper than a new
+    address.
+    """
+    p = ptr8(fb)
+    q = ptr8(sent)
+    d = ptr16(dirty)
+    count = 0
+    i = 0
+    for page in range(pages):
+        mask = 0
+        bit = 1
+        end = i + stride
+        while i < end:
+            differs = everything
+            for k in range(8):
+                if p[i + k] != q[i + k]:
+                    differs = 1
+                    q[i + k] = p[i + k]
+            if differs:
+                mask |= bit
+            bit <<= 1
+            i += 8
+        mask |= (mask << 1) & (mask >> 1)
+        d[page] = mask
+        while mask:
+            count += mask & 1
+            mask >>= 1
+    return count
+
+
+@micropython.viper
+def _run(dirty, pages: int, most: int) -> int:
+    """First run of at most `most` dirty blocks: page << 12 | first block << 8 | how many; or 0."""
+    d = ptr16(dirty)
+    for page in range(pages):
+        mask = d[page]
+        if mask:
+            first = 0
+            while mask & 1 == 0:
+                mask >>= 1
+                first += 1
+            n = 0
+            while n < most and mask & 1:
+                mask >>= 1
+                n += 1
+            return page << 12 | first << 8 | n
+    return 0
+
+
+@micropython.viper
+def _load(tx, sent, head, run: int, stride: int, offset: int):
+    """Makes the address commands and the data of a run."""
+    t = ptr8(tx)
+    s = ptr8(sent)
+    c = ptr8(head)
+    page = run >> 12
+    x = (run >> 8 & 15) << 3
+    n = (run & 255) << 3
+    i = page * stride + x
+    x += offset
+    c[1] = 0xB0 | page  # 10.1.13: page of page addressing mode
+    c[2] = x & 15  # 10.1.1, 10.1.2: column, low and high nibble
+    c[3] = 0x10 | x >> 4
+    for k in range(n):
+        t[1 + k] = s[i + k]
+
+
+class _Display(Canvas):
+    """A canvas and the flush protocol; a subclass adds the bus (`_write(data, view)`).
+
+    Drawing goes into `buffer` at any time. show()
+    compares it with `_sent`, what the display holds, and hands over the blocks of 8 columns that
+    differ; flush_step() sends them in bounded chunks. Between the two `busy` is True and only the
+    caller of flush_step() touches `_sent` and the bus, so that a hard interrupt may do it. The copy
+    costs width * height / 8 bytes and buys two things: a number redrawn as it was costs nothing on
+    the bus, and the main loop can draw the next frame while this one is sent.
+
+    With `refresh` every show() also sends one block that did not change, in turn, and after each
+    full turn the set-up again: a display that lost power for a moment, or SPI data to a glitch,
+    heals by itself in at most width * height / 64 frames. A display that stops answering is found
+    by the first failed transfer and is set up again as soon as it answers.
+
+    errors: failed transfers. dropped: frames given up. lost: the display did not answer last time.
+    """
+
+    def __init__(
+        self, first, width, height, sh1106, chunk, rotate, column_offset, contrast, refresh
+    ):
+        if width % _BLOCK or not 8 <= width <= 128:
+            raise ValueError(
+                "display width must be a multiple of 8 up to 128, not {!r}".format(width)
+            )
+        if height % 8 or not 16 <= height <= 64:  # 10.1.11: a multiplex ratio below 16 is invalid
+            raise ValueError(
+                "display height must be a multiple of 8 from 16 to 64, not {!r}".format(height)
+            )
+        if chunk % _BLOCK or not 8 <= chunk <= 128:
+            raise ValueError(
+                "chunk must be a multiple of 8 from 8 to 128 bytes, not {!r}".format(chunk)
+            )
+        if rotate not in (0, 180):
+            raise ValueError("rotate must be 0 or 180, not {!r}".format(rotate))
+        super().__init__(width, height)
+        self.pages = height // 8
+        self.chunk = chunk
+        self.busy = False
+        self.lost = False
+        self.errors = 0
+        self.dropped = 0
+        self._sent = bytearray(width * self.pages)
+        self._dirty = array("H", [0] * self.pages)
+        self._offset = (2 if sh1106 else 0) if column_offset is None else column_offset
+        self._refresh = refresh
+        self._sweep = 0
+        self._left = 0
+        self._fails = 0
+        self._everything = True
+        self._resend = False
+        self._on = True
+        # I2C sends a control byte first: 0x00 commands, 0x40 data (8.1.5.2); SPI leaves it out and
+        # has the D/C pin
+        self._tx = bytearray(1 + chunk)
+        self._tx[0] = 0x40
+        self._head = bytearray(4)
+        data = memoryview(self._tx)
+        self._views = [data[first : 1 + n] for n in range(0, chunk + 1, _BLOCK)]
+        self._head_view = memoryview(self._head)[first:]
+        self._prepare(first, sh1106, rotate, contrast)
+        self._piece = self._pieces
+
+    def _prepare(self, first, sh1106, rotate, contrast):
+        """The set-up commands (10.1), in pieces of at most 8 bytes: the tick may send them too."""
+        # Power-up also stops scrolling (2E) or, on the SH1106, starts the pump (AD 8B, only while
+        # the display is off). E3 (no operation) first: it ends a command that was cut off before
+        # its parameter.
+        begin = bytes(
+            (0x00, 0xE3, 0xE3, 0xAE, 0xAD, 0x8B) if sh1106 else (0x00, 0xE3, 0xE3, 0xAE, 0x2E)
+        )
+        # 128x32 panels are wired sequentially, the higher ones alternate (10.1.18)
+        pins = 0x02 if self.width > 2 * self.height else 0x12
+        pieces = (
+            # start line 0; segment and COM order; multiplex ratio
+            (0xE3, 0x40, 0xA0 if rotate else 0xA1, 0xC0 if rotate else 0xC8, 0xA8, self.height - 1),
+            # offset 0; COM wiring; clock
+            (0xD3, 0x00, 0xDA, pins, 0xD5, 0x50 if sh1106 else 0x80),
+            # pre-charge; VCOMH level; page addressing (the SH1106 has no other)
+            (0xD9, 0x22, 0xDB, 0x35, 0xE3, 0xE3)
+            if sh1106
+            else (0xD9, 0xF1, 0xDB, 0x30, 0x20, 0x02),
+            # contrast; show the RAM; not inverted; charge pump (SSD1306 appendix: 8D 14, then AF)
+            (0x81, contrast & 255, 0xA4, 0xA6)
+            + ((0xE3, 0xE3) if sh1106 else (0x8D, 0x14))
+            + (0xAF,),
+        )
+        pieces = [bytearray(b"\x00" + bytes(piece)) for piece in pieces]
+        self._pieces = len(pieces)
+        self._state = pieces[-1]  # its bytes 2, 4 and 7 are contrast, inverse and power
+        self._begin = memoryview(begin)[first:]
+        self._setup = [memoryview(piece)[first:] for piece in pieces]
+
+    # -------------------------------------------------------------------------- set-up and state
+
+    def begin(self):
+        """Sets the display up, shows the buffer and lights it; to be called before any tick runs.
+
+        Raises DisplayError when nothing answers. The application may go on all the same: show() and
+        flush_step() keep trying, and set the display up when it appears.
+        """
+        self._reset()
+        self.busy = False
+        self.lost = False
+        try:
+            self._write(0, self._begin)
+        except OSError:
+            self._absent()
+        # the contents are undefined at power-up: write them before the light goes on
+        self._everything = True
+        self._state[7] = 0xAE
+        try:
+            self._finish()
+        finally:
+            self.power(self._on)
+        self._finish()
+
+    def _finish(self):
+        self.show()
+        if not self.flush():
+            self._absent()
+
+    def _absent(self):
+        self.lost = True
+        raise DisplayError(self._hint())
+
+    def _reset(self):
+        pass
+
+    def contrast(self, level):
+        """Brightness 0..255; takes effect with the next show()."""
+        self._state[2] = level & 255
+        self._resend = True
+
+    def invert(self, on):
+        """Dark on light; takes effect with the next show()."""
+        self._state[4] = 0xA7 if on else 0xA6
+        self._resend = True
+
+    def power(self, on):
+        """Display on, or asleep with its contents kept; takes effect with the next show()."""
+        self._on = on
+        self._state[7] = 0xAF if on else 0xAE
+        self._resend = True
+
+    # -------------------------------------------------------------------------- sending
+
+    def show(self):
+        """Hands what was drawn to flush_step(). False while the last frame is still being sent."""
+        if self.busy:
+            return False
+        everything = 1 if self.lost or self._everything else 0
+        self._everything = False
+        if everything or self._resend:
+            self._resend = False
+            self._piece = 0
+        blocks = _changes(self.buffer, self._sent, self._dirty, self.width, self.pages, everything)
+        if self._refresh:
+            blocks += self._freshen()
+        self._left = (blocks + self._pieces - self._piece) * _BLOCK
+        # last of all: from here on the sender, perhaps an interrupt, owns _sent, _dirty and the bus
+        self.busy = self._left > 0
+        return True
+
+    def _freshen(self):
+        """Marks the next block in turn as if it had changed; returns how many that adds, 0 or 1."""
+        at = self._sweep
+        page = at >> 4
+        bit = 1 << (at & 15)
+        at += 1
+        if at & 15 >= self.width >> 3:
+            at = (at | 15) + 1
+        if at >> 4 >= self.pages:
+            at = 0
+            self._resend = True
+        self._sweep = at
+        if self._dirty[page] & bit:
+            return 0
+        self._dirty[page] |= bit
+        return 1
+
+    def flush_step(self, max_bytes):
+        """Sends at most max_bytes, and `chunk`, of the frame; only for the owner of the bus.
+
+        Returns how many bytes are still to do: 0 when done, and then `busy` is False. Allocates
+        nothing and raises nothing: a failed transfer is counted, and sent again by the next call;
+        after 8 in a row (1 when the last frame failed as well) the frame is given up and `lost`
+        set. Bytes go in eights: below 8 nothing is sent. Bus time at 400 kHz: (n + 7) * 9 bits,
+        which is 0.88 ms for n = 32 and 0.34 ms for n = 8.
+        """
+        if not self.busy:
+            return 0
+        if max_bytes < _BLOCK:
+            return self._left
+        try:
+            if self._piece < self._pieces:
+                self._write(0, self._setup[self._piece])
+                self._piece += 1
+                self._left -= _BLOCK
+            else:
+                self._send(max_bytes if max_bytes < self.chunk else self.chunk)
+        except OSError:
+            return self._failed()
+        self._fails = 0
+        if self._left <= 0:
+            self.lost = False
+            self.busy = False
+            return 0
+        return self._left
+
+    def _send(self, most):
+        run = _run(self._dirty, self.pages, most >> 3)
+        if run == 0:
+            self._left = 0
+            return
+        _load(self._tx, self._sent, self._head, run, self.width, self._offset)
+        self._write(0, self._head_view)
+        self._write(1, self._views[run & 255])
+        # only now: a chunk that failed stays marked
+        self._dirty[run >> 12] &= ~(((1 << (run & 255)) - 1) << (run >> 8 & 15))
+        self._left -= (run & 255) << 3
+
+    def _failed(self):
+        if self.errors < _MOST_ERRORS:
+            self.errors += 1
+        self._fails += 1
+        if self._piece < self._pieces:
+            self._left += self._piece * _BLOCK
+            self._piece = 0  # from the start: its no-operation ends a command that was cut in two
+        if self._fails < _ATTEMPTS and not self.lost:
+            return self._left
+        if self.dropped < _MOST_ERRORS:
+            self.dropped += 1
+        self._fails = 0
+        self.lost = True
+        self.busy = False
+        return 0
+
+    def flush(self):
+        """Sends all that show() handed over, if the main loop owns the bus. False when given up."""
+        while self.flush_step(self.chunk):
+            pass
+        return not self.lost
+
+
+class SSD1306_I2C(_Display):
+    """An SSD1306 or SH1106 on I2C.
+
+    i2c: a bus of at most 400 kHz (8.1.5). address: 0x3C or 0x3D. chunk: bytes that flush_step()
+    sends at most, a multiple of 8 up to 128. rotate: 0 or 180. column_offset: of the panel's first
+    column, default 0 (SH1106: 2).
+    """
+
+    def __init__(
+        self,
+        i2c,
+        width=128,
+        height=64,
+        address=0x3C,
+        sh1106=False,
+        chunk=32,
+        rotate=0,
+        column_offset=None,
+        contrast=0xFF,
+        refresh=True,
+    ):
+        super().__init__(0, width, height, sh1106, chunk, rotate, column_offset, contrast, refresh)
+        self.i2c = i2c
+        self.address = address
+
+    def _write(self, data, view):
+        self.i2c.writeto(self.address, view)
+
+    def _hint(self):
+        text = "no display answers at 0x{:02X}: check VCC, GND, SDA, SCL, or try address 0x{:02X}"
+        return text.format(self.address, self.address ^ 1)
+
+
+class SSD1306_SPI(_Display):
+    """An SSD1306 (at most 10 MHz, table 13-4) or SH1106 (at most 2 MHz) on SPI, mode 0 or 3.
+
+    dc, rst, cs: pins set up as outputs and callable with 0 or 1; rst and cs may be None (tied on
+    the board). The rest as for SSD1306_I2C. A display on SPI cannot be asked whether it is there.
+    """
+
+    def __init__(
+        self,
+        spi,
+        dc,
+        rst=None,
+        cs=None,
+        width=128,
+        height=64,
+        sh1106=False,
+        chunk=32,
+        rotate=0,
+        column_offset=None,
+        contrast=0xFF,
+        refresh=True,
+    ):
+        super().__init__(1, width, height, sh1106, chunk, rotate, column_offset, contrast, refresh)
+        self.spi = spi
+        self.dc = dc
+        self.rst = rst
+        self.cs = cs
+
+    def _reset(self):
+        if self.cs is not None:
+            self.cs(1)
+        if self.rst is not None:
+            self.rst(1)
+            time.sleep_ms(1)
+            self.rst(0)
+            time.sleep_ms(1)  # 8.9: at least 3 us (SH1106: 10 us)
+            self.rst(1)
+            time.sleep_ms(1)
+
+    def _write(self, data, view):
+        self.dc(data)
+        if self.cs is None:
+            self.spi.write(view)
+            return
+        self.cs(0)
+        self.spi.write(view)
+        self.cs(1)
+
+    def _hint(self):
+        return "the SPI bus of the display failed: check its pins"

@@ -1,0 +1,33 @@
+# The doctor's report on a simulated board at rest. Run by `upright doctor --simulated` and the tests. Argument: a JSON
+# file: board_name, and what of its parts is missing (imu, mag, display: false) or another one (who_am_i).
+
+import json
+import sys
+
+import kernel
+import machine
+from world import StillWorld
+
+import boards
+
+
+def main():
+    with open(sys.argv[1]) as file:
+        config = json.load(file)
+    machine.power_on()
+    # level, a field of 49 uT that dips by 60 degrees into the ground, heading north
+    world = StillWorld((0, 0, 4096, 0, 0, 0, 82, 0, -141))
+    world.start(0)
+    kernel.advance(200000)  # so long do the chips take after power-up
+
+    import board
+
+    boards.wire(config.get("board_name", "sim"), board, world, config)
+
+    from upright_app import doctor
+
+    problems = doctor.report(board)
+    print("\tresult", json.dumps({"problems": problems}))
+
+
+main()

