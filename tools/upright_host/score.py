@@ -260,7 +260,7 @@ def _baseline(name, file, trial, seconds):
     """Run in a process of its own: other people's compiled code may end it."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "attitudes"
-        argv = [sys.executable, "-m", "upright.baselines", name, str(Path(file).resolve())]
+        argv = [sys.executable, "-m", "upright_host.baselines", name, str(Path(file).resolve())]
         done = subprocess.run(
             [*argv, str(trial.rows(seconds)), str(out)], capture_output=True, text=True
         )
