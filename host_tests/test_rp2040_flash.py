@@ -13,7 +13,7 @@ from upright_host import rp2040 as firmware
 pytestmark = [pytest.mark.xdist_group("rp2040_flash"), pytest.mark.slow, pytest.mark.timeout(1800)]
 
 PICO = device.Facts("rp2", "Pico", (1, 26, 1), 6, 3, "armv6m", True, False, True, True, 0)
-OLD_CONFIG = b"import no_such_module"  # what the older installation has: it would not start
+OLD_SETTINGS = b"import no_such_module"  # what the older installation has: it would not start
 SNAPSHOT_US = 2000
 
 
@@ -57,8 +57,11 @@ def new():
 @pytest.fixture(scope="module")
 def old(new):
     """An older installation: one module is another, one is missing, one is there as its source."""
-    older = new | {"config.mpy": OLD_CONFIG, "lib/upright/ssd1306.py": b"raise OSError"}
-    del older["filters.mpy"]
+    older = new | {
+        "lib/upright/settings.mpy": OLD_SETTINGS,
+        "lib/upright/ssd1306.py": b"raise OSError",
+    }
+    del older["lib/upright/filters.mpy"]
     return older
 
 
@@ -145,6 +148,6 @@ def test_mip_installs_a_package_from_an_index_and_it_can_be_imported(image, tmp_
     assert found == {
         "lib/upright/auxiliary_bus.py": (paths.PACKAGE / "auxiliary_bus.py").read_bytes()
     }
-    board.exec("import auxiliary_bus")
+    board.exec("from upright import auxiliary_bus")
     assert board.eval("auxiliary_bus.__file__") == "/lib/upright/auxiliary_bus.py"
     assert board.eval("auxiliary_bus.AuxiliaryBus.__name__") == "AuxiliaryBus"
