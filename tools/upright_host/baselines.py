@@ -2,8 +2,8 @@
 
 Every one gets the same counts in its units, the raw gyro, its own defaults, and what it cannot know by itself: the
 rate, and the gyro's range. All estimates are causal: row i knows the samples up to i. The packages are the optional
-extra `baselines`. `python -m upright_host.baselines NAME TRIAL.npz ROWS OUT` runs one of them in a process of its own and
-writes float64 (n, 4).
+extra `baselines`. `python -m upright_host.baselines NAME TRIAL.npz ROWS OUT` runs one of them in a process of its own
+and writes float64 (n, 4).
 """
 
 import importlib
