@@ -296,7 +296,8 @@ class _Wire:
         self.trigger = 0
 
     def due(self):
-        return self.chip.next_event()
+        # only an interrupt has to see an edge when it comes: whoever reads the pin gets the level of that moment
+        return self.chip.next_event() if self.irq else None
 
     def fire(self, now):
         self.chip.poll(now)
@@ -369,6 +370,10 @@ class Pin:
         wire = self._wire
         if wire.irq:
             wire.irq.cancel()
+            wire.irq = None
+        if wire.chip:
+            wire.fire(kernel.now())  # what came before is no edge for this handler
+            kernel.changed()
         wire.irq = kernel.Irq(handler, self, hard) if handler else None
         wire.trigger = trigger
         return wire.irq

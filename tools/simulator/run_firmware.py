@@ -91,6 +91,7 @@ class Recorder:
             return
         self._steps = app.tick.steps
         app.filter.quaternion(self._q)
+        self._chip.poll(kernel.now())
         self._row[0] = self._world.index_at(self._chip.sample_us)
         for i in range(4):
             self._row[1 + i] = self._q[i]
