@@ -1,6 +1,5 @@
-# Drawing into a page-format frame buffer (SSD1306, SH1106) without allocating anything.
-# Needs ssd1306_font.py beside it and viper; runs on boards, the unix port and, with the host shim,
-# CPython.
+# Drawing into a page-format frame buffer (SSD1306, SH1106) without allocating anything. Needs
+# font.py of this package and viper; runs on boards, the unix port and, with the host shim, CPython.
 
 import sys
 
@@ -9,15 +8,14 @@ from micropython import const
 
 from upright.font import LARGE, SMALL, TALL, columns  # noqa: F401 (sizes are part of this module)
 
-# Colours. OPAQUE and INVERSE draw a character's whole cell: a number drawn in place replaces the
-# old.
+# Colours. OPAQUE and INVERSE draw a character's whole cell, so that a number replaces the old one.
 BLACK = const(0)
 WHITE = const(1)
 XOR = const(2)
 OPAQUE = const(3)
 INVERSE = const(4)
 
-_SMALL = const(1)  # ssd1306_font.SMALL, for viper
+_SMALL = const(1)  # font.SMALL, for viper
 _ENCODE = sys.implementation.name == "cpython"  # there a str has no buffer to point at
 
 
@@ -43,16 +41,17 @@ def _fill(fb, stride: int, height: int, x: int, y: int, w: int, h: int, colour: 
             mask = 255 << (y - top)
         if top + 8 > y1:
             mask &= 255 >> (top + 8 - y1)
-        mask &= 255
+        # new = (old & keep) ^ flip
+        flip = mask & 255
+        keep = 255 ^ flip
+        if colour == XOR:
+            keep = 255
+        elif colour & 1 == 0:  # BLACK, INVERSE
+            flip = 0
         i = page * stride + x
         end = page * stride + x1
         while i < end:
-            if colour == XOR:
-                p[i] = p[i] ^ mask
-            elif colour & 1:  # WHITE, OPAQUE
-                p[i] = p[i] | mask
-            else:
-                p[i] = p[i] & (255 ^ mask)
+            p[i] = (p[i] & keep) ^ flip
             i += 1
         page += 1
 
@@ -101,16 +100,10 @@ def _line(fb, stride: int, height: int, x0: int, y0: int, x1: int, y1: int, colo
     p = ptr8(fb)
     dx = int(abs(x1 - x0))
     dy = 0 - int(abs(y1 - y0))
-    sx = 1
-    if x0 > x1:
-        sx = -1
-    sy = 1
-    if y0 > y1:
-        sy = -1
+    sx = -1 if x0 > x1 else 1
+    sy = -1 if y0 > y1 else 1
     e = dx + dy
-    left = dx
-    if left < 0 - dy:
-        left = 0 - dy
+    left = dx if dx > 0 - dy else 0 - dy
     while left >= 0:
         if x0 >= 0 and x0 < stride and y0 >= 0 and y0 < height:
             i = (y0 >> 3) * stride + x0
@@ -137,9 +130,7 @@ def _text(
 ) -> int:
     """n characters of UTF-8, or n bytes that stand for themselves; returns the x after them."""
     p = ptr8(s)
-    h = 16
-    if size == _SMALL:
-        h = 8
+    h = 8 if size == _SMALL else 16
     i = 0
     while n > 0:
         code = p[i]
@@ -227,6 +218,13 @@ class Canvas:
         self.buffer = bytearray(width * (height // 8))
         self._cols = bytearray(24)
         self._ascii = bytearray(48)
+
+    @property
+    def framebuffer(self):
+        """A new framebuf.FrameBuffer that draws into `buffer`; ImportError where a port has none."""
+        import framebuf
+
+        return framebuf.FrameBuffer(self.buffer, self.width, self.height, framebuf.MONO_VLSB)
 
     # native: default arguments without a frame on the heap, which bytecode takes beyond 11 words
 

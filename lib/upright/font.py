@@ -1,6 +1,6 @@
-# Font of the OLED writer: every printable ASCII character and the degree sign in 6x8, digits and
-# signs in 12x16. Needs viper (MicroPython) or the host shim; runs on any board and on the host. The
-# drawings are this project's own.
+# Font of canvas.py: every printable ASCII character and the degree sign in 6x8, digits and signs in
+# 12x16; the drawings are this project's own. Needs viper; runs on boards, the unix port and, with
+# the host shim, CPython.
 
 import micropython
 from micropython import const
@@ -89,21 +89,11 @@ def _drawn(code: int) -> int:
         return code - 48
     if code == 43:
         return 10
-    if code == 45:
-        return 11
-    if code == 46:
-        return 12
+    if code == 45 or code == 46:
+        return code - 34
     if code == _DEGREE:
         return 13
     return -1
-
-
-@micropython.viper
-def advance(code: int, size: int) -> int:
-    """Width in pixels of a character's cell: 6, or 12 in LARGE, where the point takes 6."""
-    if size == LARGE and code != 46:
-        return 12
-    return 6
 
 
 @micropython.viper
@@ -132,7 +122,7 @@ def columns(code: int, size: int, out) -> int:
     """Writes a character's cell into out: little-endian 16-bit columns, bit 0 on top.
 
     code: Unicode; one that the font lacks shows as ?. out: bytearray of 24 bytes. Returns the
-    cell's width.
+    cell's width: 6, or 12 in LARGE, where the point takes 6.
     """
     o = ptr8(out)
     if size == LARGE:
@@ -142,7 +132,7 @@ def columns(code: int, size: int, out) -> int:
             n *= 24
             for i in range(24):
                 o[i] = big[n + i]
-            return int(advance(code, size))
+            return 6 if code == 46 else 12
     n = code - 32
     if code == _DEGREE:
         n = 95

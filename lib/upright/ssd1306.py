@@ -1,8 +1,7 @@
-# Writer for SSD1306 and SH1106 OLED displays, I2C or SPI, that never allocates once it is set up.
-# Needs ssd1306_canvas.py and ssd1306_font.py beside it, viper, and a bus object with `writeto`
-# (I2C) or `write` (SPI); runs on boards, the unix port and, with the host shim, CPython. Section
-# numbers are those of the SSD1306 datasheet, rev 1.1; what differs on the SH1106 is from its own,
-# v2.3.
+# Driver of SSD1306 and SH1106 OLED displays on I2C or SPI; it allocates nothing once it is set up.
+# Needs canvas.py and font.py of this package, viper, and a bus with `writeto` (I2C) or `write`
+# (SPI); runs on boards, the unix port and, with the host shim, CPython. Section numbers are those
+# of the SSD1306 datasheet, rev 1.1; what differs on the SH1106 is from its own, v2.3.
 
 import time
 from array import array
@@ -103,51 +102,104 @@ def _load(tx, sent, head, run: int, stride: int, offset: int):
         t[1 + k] = s[i + k]
 
 
-class _Display(Canvas):
-    """A canvas and the flush protocol; a subclass adds the bus (`_write(data, view)`).
+def _parse(panel):
+    """The name of a panel -> (whether its controller is an SH1106, width, height)."""
+    try:
+        controller, size = panel.split()
+        width, height = map(int, size.split("x"))
+    except (AttributeError, ValueError):
+        controller = None
+    if controller not in ("SSD1306", "SH1106"):
+        raise ValueError(
+            'name the panel "SSD1306 128x64", "SH1106 128x64" or alike, not %r' % (panel,)
+        )
+    if width % _BLOCK or not 8 <= width <= 128:
+        raise ValueError("display width must be a multiple of 8 up to 128, not %d" % width)
+    if height % 8 or not 16 <= height <= 64:  # 10.1.11: a multiplex ratio below 16 is invalid
+        raise ValueError("display height must be a multiple of 8 from 16 to 64, not %d" % height)
+    return controller == "SH1106", width, height
 
-    Drawing goes into `buffer` at any time. show()
-    compares it with `_sent`, what the display holds, and hands over the blocks of 8 columns that
-    differ; flush_step() sends them in bounded chunks. Between the two `busy` is True and only the
-    caller of flush_step() touches `_sent` and the bus, so that a hard interrupt may do it. The copy
-    costs width * height / 8 bytes and buys two things: a number redrawn as it was costs nothing on
-    the bus, and the main loop can draw the next frame while this one is sent.
+
+class SSD1306(Canvas):
+    """An SSD1306 or SH1106 display on I2C or SPI: a canvas, and what sends it.
+
+    bus: machine.I2C at up to 400 kHz (8.1.5), or machine.SPI in mode 0 or 3 at up to 10 MHz (table
+    13-4; SH1106: 2 MHz). panel: controller and size: "SSD1306 128x64" (also 128x32, 96x16, 72x40,
+    64x48, 64x32) or "SH1106 128x64"; an SSD1315 counts as an SSD1306. address: 0x3C or 0x3D, on
+    I2C. dc, rst, cs: on SPI, output pins that can be called with 0 or 1; rst and cs are None where
+    the module ties them. chunk: bytes that flush_step() sends at most, a multiple of 8 up to 128.
+    rotate: 0 or 180. column_offset: the controller's column of the panel's left edge at rotate=0;
+    by default the panel sits in the middle of the controller's 128 (SH1106: 132) columns.
+
+    Drawing goes into `buffer` at any time. show() compares it with `_sent`, what the display holds,
+    and hands over the blocks of 8 columns that differ; flush_step() sends them in bounded chunks.
+    Between the two `busy` is True and only the caller of flush_step() touches `_sent` and the bus,
+    so that a hard interrupt may do it. The copy costs width * height / 8 bytes. A number redrawn as
+    it was costs nothing on the bus, and the main loop can draw while the last frame is sent.
 
     With `refresh` every show() also sends one block that did not change, in turn, and after each
     full turn the set-up again: a display that lost power for a moment, or SPI data to a glitch,
-    heals by itself in at most width * height / 64 frames. A display that stops answering is found
-    by the first failed transfer and is set up again as soon as it answers.
+    heals in at most width * height / 64 frames. A display that stops answering is found by the
+    first failed transfer and is set up again as soon as it answers.
 
     errors: failed transfers. dropped: frames given up. lost: the display did not answer last time.
     """
 
     def __init__(
-        self, first, width, height, sh1106, chunk, rotate, column_offset, contrast, refresh
+        self,
+        bus,
+        panel="SSD1306 128x64",
+        address=0x3C,
+        dc=None,
+        rst=None,
+        cs=None,
+        chunk=32,
+        rotate=0,
+        column_offset=None,
+        contrast=0xFF,
+        refresh=True,
+        **unknown,
     ):
-        if width % _BLOCK or not 8 <= width <= 128:
+        if unknown or isinstance(bus, int):
             raise ValueError(
-                "display width must be a multiple of 8 up to 128, not {!r}".format(width)
+                'call SSD1306(bus, "SSD1306 128x64"): first the bus, then the panel\'s name; an I2C '
+                "address is address=, the pins of SPI are dc=, rst=, cs="
             )
-        if height % 8 or not 16 <= height <= 64:  # 10.1.11: a multiplex ratio below 16 is invalid
-            raise ValueError(
-                "display height must be a multiple of 8 from 16 to 64, not {!r}".format(height)
-            )
+        i2c = hasattr(bus, "writeto")
+        if not i2c and dc is None:
+            raise ValueError("a display on SPI needs dc=, the output pin that its D/C is wired to")
+        if i2c and address not in (0x3C, 0x3D):
+            hint = "must be 0x3C or 0x3D"
+            if address >> 1 in (0x3C, 0x3D):
+                hint = "is the 8-bit form, as modules print it: pass 0x%02X" % (address >> 1)
+            raise ValueError("display address 0x%02X %s" % (address, hint))
+        sh1106, width, height = _parse(panel)
         if chunk % _BLOCK or not 8 <= chunk <= 128:
-            raise ValueError(
-                "chunk must be a multiple of 8 from 8 to 128 bytes, not {!r}".format(chunk)
-            )
+            raise ValueError("chunk must be a multiple of 8 from 8 to 128 bytes, not %d" % chunk)
         if rotate not in (0, 180):
-            raise ValueError("rotate must be 0 or 180, not {!r}".format(rotate))
+            raise ValueError("rotate must be 0 or 180, not %r" % (rotate,))
+        spare = (132 if sh1106 else 128) - width
+        if column_offset is None:
+            # 96x16 panels are wired to the last 96 segments, which are columns 0 to 95 (u8g2,
+            # u8x8_d_ssd1306_96x16.c); all others to the middle (micropython-lib, u8g2)
+            column_offset = 0 if (width, height) == (96, 16) else spare >> 1
+        if not 0 <= column_offset <= spare:
+            raise ValueError("column_offset must be 0 to %d, not %r" % (spare, column_offset))
         super().__init__(width, height)
+        self.bus = bus
+        self.address = address
         self.pages = height // 8
         self.chunk = chunk
         self.busy = False
         self.lost = False
         self.errors = 0
         self.dropped = 0
+        self._dc = None if i2c else dc
+        self._rst = rst
+        self._cs = cs
         self._sent = bytearray(width * self.pages)
         self._dirty = array("H", [0] * self.pages)
-        self._offset = (2 if sh1106 else 0) if column_offset is None else column_offset
+        self._offset = spare - column_offset if rotate else column_offset
         self._refresh = refresh
         self._sweep = 0
         self._left = 0
@@ -157,44 +209,48 @@ class _Display(Canvas):
         self._on = True
         # I2C sends a control byte first: 0x00 commands, 0x40 data (8.1.5.2); SPI leaves it out and
         # has the D/C pin
+        first = 0 if i2c else 1
         self._tx = bytearray(1 + chunk)
         self._tx[0] = 0x40
         self._head = bytearray(4)
         data = memoryview(self._tx)
         self._views = [data[first : 1 + n] for n in range(0, chunk + 1, _BLOCK)]
         self._head_view = memoryview(self._head)[first:]
-        self._prepare(first, sh1106, rotate, contrast)
-        self._piece = self._pieces
-
-    def _prepare(self, first, sh1106, rotate, contrast):
-        """The set-up commands (10.1), in pieces of at most 8 bytes: the tick may send them too."""
         # Power-up also stops scrolling (2E) or, on the SH1106, starts the pump (AD 8B, only while
         # the display is off). E3 (no operation) first: it ends a command that was cut off before
         # its parameter.
-        begin = bytes(
-            (0x00, 0xE3, 0xE3, 0xAE, 0xAD, 0x8B) if sh1106 else (0x00, 0xE3, 0xE3, 0xAE, 0x2E)
-        )
-        # 128x32 panels are wired sequentially, the higher ones alternate (10.1.18)
-        pins = 0x02 if self.width > 2 * self.height else 0x12
-        pieces = (
-            # start line 0; segment and COM order; multiplex ratio
-            (0xE3, 0x40, 0xA0 if rotate else 0xA1, 0xC0 if rotate else 0xC8, 0xA8, self.height - 1),
-            # offset 0; COM wiring; clock
-            (0xD3, 0x00, 0xDA, pins, 0xD5, 0x50 if sh1106 else 0x80),
-            # pre-charge; VCOMH level; page addressing (the SH1106 has no other)
-            (0xD9, 0x22, 0xDB, 0x35, 0xE3, 0xE3)
-            if sh1106
-            else (0xD9, 0xF1, 0xDB, 0x30, 0x20, 0x02),
-            # contrast; show the RAM; not inverted; charge pump (SSD1306 appendix: 8D 14, then AF)
-            (0x81, contrast & 255, 0xA4, 0xA6)
-            + ((0xE3, 0xE3) if sh1106 else (0x8D, 0x14))
-            + (0xAF,),
-        )
-        pieces = [bytearray(b"\x00" + bytes(piece)) for piece in pieces]
-        self._pieces = len(pieces)
-        self._state = pieces[-1]  # its bytes 2, 4 and 7 are contrast, inverse and power
+        begin = b"\x00\xe3\xe3\xae\xad\x8b" if sh1106 else b"\x00\xe3\xe3\xae\x2e"
         self._begin = memoryview(begin)[first:]
+        pieces = self._commands(sh1106, rotate, contrast)
         self._setup = [memoryview(piece)[first:] for piece in pieces]
+        self._state = pieces[-1]  # its bytes 2, 4 and 7 are contrast, inverse and power
+        self._pieces = len(pieces)
+        self._piece = self._pieces
+
+    def _commands(self, sh1106, rotate, contrast):
+        """The set-up (10.1) in pieces of at most 8 bytes, since the tick may send them, too."""
+        # Panels of fewer columns come without the resistor of the brightness current and are dim
+        # without AD 30, the internal one of 30 uA (SSD1306B and SSD1315; others ignore it:
+        # micropython/micropython#7411, rust-embedded-community/ssd1306#141).
+        current = (0xE3, 0xE3) if sh1106 or self.width == 128 else (0xAD, 0x30)
+        # 128x32 and 96x16 panels are wired sequentially, the others alternate (10.1.18)
+        pins = 0x02 if self.width > 2 * self.height else 0x12
+        return [
+            bytearray(b"\x00" + bytes(piece))
+            for piece in (
+                # segment and COM order; multiplex ratio; current
+                (0xE3, 0xA0 if rotate else 0xA1, 0xC0 if rotate else 0xC8, 0xA8, self.height - 1)
+                + current,
+                # start line 0; offset 0; COM wiring; clock
+                (0x40, 0xD3, 0x00, 0xDA, pins, 0xD5, 0x50 if sh1106 else 0x80),
+                # pre-charge; VCOMH level; page addressing (the SH1106 has no other)
+                (0xD9, 0x22, 0xDB, 0x35) if sh1106 else (0xD9, 0xF1, 0xDB, 0x30, 0x20, 0x02),
+                # contrast; show the RAM; not inverted; charge pump (appendix: 8D 14, then AF)
+                (0x81, contrast & 255, 0xA4, 0xA6)
+                + ((0xE3, 0xE3) if sh1106 else (0x8D, 0x14))
+                + (0xAF,),
+            )
+        ]
 
     # -------------------------------------------------------------------------- set-up and state
 
@@ -204,12 +260,18 @@ class _Display(Canvas):
         Raises DisplayError when nothing answers. The application may go on all the same: show() and
         flush_step() keep trying, and set the display up when it appears.
         """
-        self._reset()
+        if self._cs is not None:
+            self._cs(1)
+        if self._rst is not None:
+            for level in (1, 0, 1):
+                self._rst(level)
+                time.sleep_ms(1)  # 8.9: low for at least 3 us (SH1106: 10 us)
         self.busy = False
         self.lost = False
         try:
             self._write(0, self._begin)
         except OSError:
+            self.errors += 1
             self._absent()
         # the contents are undefined at power-up: write them before the light goes on
         self._everything = True
@@ -227,10 +289,15 @@ class _Display(Canvas):
 
     def _absent(self):
         self.lost = True
-        raise DisplayError(self._hint())
-
-    def _reset(self):
-        pass
+        if self._dc is not None:
+            raise DisplayError("the SPI bus of the display failed: check its pins")
+        text = "no display answers at 0x{:02X} (nor at 0x{:02X}): check VCC, GND, SDA and SCL"
+        try:
+            self.bus.writeto(self.address ^ 1, b"\x00\xe3")  # no operation
+            text = "no display answers at 0x{:02X}, but one does at 0x{:02X}: pass that as address="
+        except OSError:
+            pass
+        raise DisplayError(text.format(self.address, self.address ^ 1))
 
     def contrast(self, level):
         """Brightness 0..255; takes effect with the next show()."""
@@ -347,87 +414,18 @@ class _Display(Canvas):
             pass
         return not self.lost
 
-
-class SSD1306_I2C(_Display):
-    """An SSD1306 or SH1106 on I2C.
-
-    i2c: a bus of at most 400 kHz (8.1.5). address: 0x3C or 0x3D. chunk: bytes that flush_step()
-    sends at most, a multiple of 8 up to 128. rotate: 0 or 180. column_offset: of the panel's first
-    column, default 0 (SH1106: 2).
-    """
-
-    def __init__(
-        self,
-        i2c,
-        width=128,
-        height=64,
-        address=0x3C,
-        sh1106=False,
-        chunk=32,
-        rotate=0,
-        column_offset=None,
-        contrast=0xFF,
-        refresh=True,
-    ):
-        super().__init__(0, width, height, sh1106, chunk, rotate, column_offset, contrast, refresh)
-        self.i2c = i2c
-        self.address = address
-
     def _write(self, data, view):
-        self.i2c.writeto(self.address, view)
-
-    def _hint(self):
-        text = "no display answers at 0x{:02X}: check VCC, GND, SDA, SCL, or try address 0x{:02X}"
-        return text.format(self.address, self.address ^ 1)
-
-
-class SSD1306_SPI(_Display):
-    """An SSD1306 (at most 10 MHz, table 13-4) or SH1106 (at most 2 MHz) on SPI, mode 0 or 3.
-
-    dc, rst, cs: pins set up as outputs and callable with 0 or 1; rst and cs may be None (tied on
-    the board). The rest as for SSD1306_I2C. A display on SPI cannot be asked whether it is there.
-    """
-
-    def __init__(
-        self,
-        spi,
-        dc,
-        rst=None,
-        cs=None,
-        width=128,
-        height=64,
-        sh1106=False,
-        chunk=32,
-        rotate=0,
-        column_offset=None,
-        contrast=0xFF,
-        refresh=True,
-    ):
-        super().__init__(1, width, height, sh1106, chunk, rotate, column_offset, contrast, refresh)
-        self.spi = spi
-        self.dc = dc
-        self.rst = rst
-        self.cs = cs
-
-    def _reset(self):
-        if self.cs is not None:
-            self.cs(1)
-        if self.rst is not None:
-            self.rst(1)
-            time.sleep_ms(1)
-            self.rst(0)
-            time.sleep_ms(1)  # 8.9: at least 3 us (SH1106: 10 us)
-            self.rst(1)
-            time.sleep_ms(1)
-
-    def _write(self, data, view):
-        self.dc(data)
-        if self.cs is None:
-            self.spi.write(view)
+        if self._dc is None:
+            self.bus.writeto(self.address, view)
             return
-        self.cs(0)
-        self.spi.write(view)
-        self.cs(1)
+        self._dc(data)
+        if self._cs is None:
+            self.bus.write(view)
+            return
+        self._cs(0)
+        self.bus.write(view)
+        self._cs(1)
 
-    def _hint(self):
-        return "the SPI bus of the display failed: check its pins"
+
+# micropython-lib's names: code that is moved over from there is told how to call this class
+SSD1306_I2C = SSD1306_SPI = SSD1306

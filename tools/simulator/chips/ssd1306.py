@@ -5,23 +5,19 @@
 _PAGE, _HORIZONTAL, _VERTICAL = 2, 0, 1  # 20h, table 9-1
 
 # Commands with parameters, and how many (table 9-1); all others are single bytes.
-_COMMON = {0x81: 1, 0xA8: 1, 0xD3: 1, 0xD5: 1, 0xD9: 1, 0xDA: 1, 0xDB: 1}
+_COMMON = {0x81: 1, 0xA8: 1, 0xAD: 1, 0xD3: 1, 0xD5: 1, 0xD9: 1, 0xDA: 1, 0xDB: 1}
 _SSD1306 = {0x20: 1, 0x21: 2, 0x22: 2, 0x26: 6, 0x27: 6, 0x29: 5, 0x2A: 5, 0xA3: 2, 0x8D: 1}
-_SH1106 = {0xAD: 1}
-
-
-def _parameters(sh1106):
-    table = dict(_COMMON)
-    table.update(_SH1106 if sh1106 else _SSD1306)
-    return table
 
 
 class SSD1306Chip:
     """An SSD1306 (or SH1106) and a panel of width x height pixels, as it is after power-up.
 
     address: 7-bit I2C address. sh1106: 132 columns, page addressing only. The panel's columns sit
-    in the middle of the controller's (so a 128-column panel starts at column 2 of an SH1106).
-    Panels wider than twice their height are wired sequentially, others alternating (10.1.18).
+    in the middle of the controller's (so a 128-column panel starts at column 2 of an SH1106), but
+    those of 96x16 are the last 96 segments (u8g2, u8x8_d_ssd1306_96x16.c: column 0, and 32 when
+    turned); what lies beyond is not seen. Panels wider than twice their height are wired
+    sequentially, others alternating (10.1.18). Panels below 128 columns have no resistor for the
+    brightness current (u8g2#1047, rust-embedded-community/ssd1306#141).
 
     What silicon would take wrongly, and what the datasheet forbids, is noted in `errors`, a list of
     str; nothing is forgiven. `ram` is the GDDRAM, a bytearray of 8 pages, by segment, not by column
@@ -36,7 +32,8 @@ class SSD1306Chip:
         self.columns = 132 if sh1106 else 128
         # table 13-4: a clock cycle of at least 100 ns; SH1106: 500 ns over its whole supply range
         self.spi_max_hz = spi_max_hz or (2000000 if sh1106 else 10000000)
-        self.first_segment = (self.columns - width) // 2
+        spare = self.columns - width
+        self.first_segment = spare if (width, height) == (96, 16) else spare // 2
         self.sequential = width > 2 * height
         self.int_level = 0
         self.dc = 0
@@ -45,7 +42,9 @@ class SSD1306Chip:
         self.command_bytes = 0
         self.transactions = 0
         self.powered = True
-        self._table = _parameters(sh1106)
+        self._table = dict(_COMMON)
+        if not sh1106:
+            self._table.update(_SSD1306)
         self._skip = 0
         self._nacks = 0
         self._selected = False
@@ -83,6 +82,7 @@ class SSD1306Chip:
         # SSD1306 appendix: the pump is off; SH1106 (AD 8B): it comes on with the display
         self.pump = self.sh1106
         self.pump_running = False
+        self.internal_current = False
         self.scrolling = False
         self._column_start = 0
         self._saved_column = None
@@ -326,9 +326,12 @@ class SSD1306Chip:
         elif command == 0xDB:
             self.vcomh = value
             return self.sh1106 or value in (0x00, 0x20, 0x30)
-        elif command == 0xAD:  # SH1106: 8A off, 8B on, only while the display is off
+        elif command == 0xAD and self.sh1106:  # pump: 8A off, 8B on, only while the display is off
             self.pump = value == 0x8B
             return value & 0xFE == 0x8A and not self.display_on
+        elif command == 0xAD:  # SSD1306B, SSD1315: A[4] internal current, A[5] 30 uA, not 19
+            self.internal_current = value & 0x10 != 0
+            return value & 0xCF == 0
         elif command == 0x8D:
             self.pump = value & 4 != 0
             if not self.pump:
@@ -364,6 +367,11 @@ class SSD1306Chip:
     def lit(self):
         """False: dark, whatever the RAM holds (no power, display off or no charge pump)."""
         return self.powered and self.display_on and self.pump_running
+
+    @property
+    def dim(self):
+        """About a third of the brightness: a small panel without the internal current."""
+        return self.width < 128 and not self.sh1106 and not self.internal_current
 
     def _ram_line(self, y):
         """RAM line shown in row y of the upright panel; None: this row is not driven."""
