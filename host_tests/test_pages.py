@@ -56,7 +56,7 @@ def test_one_pixel_more_is_noticed():
 def bench():
     chip = SSD1306Chip()
     machine.wire_i2c(0, chip)
-    display = ssd1306.SSD1306_I2C(machine.I2C(0))
+    display = ssd1306.SSD1306(machine.I2C(0))
     display.begin()
     return chip, display, pages.Pages(display)
 
@@ -117,7 +117,7 @@ def test_any_attitude_stays_inside_its_part_of_the_page(roll, pitch, yaw, height
         def writeto(self, address, data):
             pass
 
-    display = ssd1306.SSD1306_I2C(Nowhere(), height=height)
+    display = ssd1306.SSD1306(Nowhere(), f"SSD1306 128x{height}")
     book = pages.Pages(display)
     angles = array("i", (roll, pitch, yaw))
     book.draw(pages.HORIZON, angles, 200, 2500, 0, 0)

@@ -218,7 +218,7 @@ def test_the_displays_memory_is_what_cpythons_simulation_draws(landed, page):
     assert (rate_hz, faults) == (200, 0)
     chip = SSD1306Chip()
     machine.wire_i2c(0, chip)
-    display = ssd1306.SSD1306_I2C(machine.I2C(0))
+    display = ssd1306.SSD1306(machine.I2C(0))
     display.begin()
     pages.Pages(display).draw(page, array("i", angles), rate_hz, temperature, faults, 0)
     display.show()

@@ -1,4 +1,4 @@
-"""The OLED writer: drawing against a naive reference, numbers against Python's, and the way to the glass."""
+"""The OLED driver: drawing against a naive reference, numbers against Python's, and the way to the glass."""
 
 import sys
 from decimal import ROUND_HALF_UP, Decimal
@@ -20,7 +20,7 @@ SIZES = st.sampled_from((SMALL, LARGE, TALL))
 
 
 class ChipBus:
-    """The shortest way from the writer to the chip: a bus for I2C and for SPI, which counts."""
+    """The shortest way from the driver to the chip: an I2C bus that counts."""
 
     def __init__(self, chip):
         self.chip = chip
@@ -42,11 +42,12 @@ class ChipBus:
             chip.i2c_stop(0)
 
 
-def bench(begin=True, width=128, height=64, sh1106=False, address=0x3C, **options):
-    chip = SSD1306Chip(address=address, width=width, height=height, sh1106=sh1106)
+def bench(panel="SSD1306 128x64", begin=True, chip_address=0x3C, **options):
+    controller, size = panel.split()
+    width, height = map(int, size.split("x"))
+    chip = SSD1306Chip(chip_address, width, height, controller == "SH1106")
     bus = ChipBus(chip)
-    options.setdefault("column_offset", chip.first_segment)
-    display = ssd1306.SSD1306_I2C(bus, width, height, sh1106=sh1106, **options)
+    display = ssd1306.SSD1306(bus, panel, **options)
     if begin:
         display.begin()
     return chip, bus, display
@@ -210,6 +211,31 @@ def test_text_takes_bytes_one_character_each():
     assert d.text("5\u00b0".encode(), 0, 0) == 18, "three bytes"
 
 
+# ---------------------------------------------------------------- framebuf, and another driver
+
+# as micropython-lib's: a module of this name whose class has this signature
+ANOTHER = """
+import framebuf
+class SSD1306_I2C(framebuf.FrameBuffer):
+    def __init__(self, width, height, i2c, addr=0x3C, external_vcc=False):
+        self.width = width
+        super().__init__(bytearray(width * height // 8), width, height, framebuf.MONO_VLSB)
+"""
+
+
+def test_framebuf_draws_into_our_buffer_with_another_ssd1306_beside_it(
+    micropython_runtime, portable, tmp_path
+):
+    (tmp_path / "ssd1306.py").write_text(ANOTHER)
+    printed = portable(micropython_runtime, "framebuffer.py", str(tmp_path))
+    assert printed.split("\n")[:3] == ["128 64 shown", "72 40 shown", "128"]
+
+
+def test_without_framebuf_it_is_an_import_error():
+    with pytest.raises(ImportError, match="framebuf"):
+        canvas().framebuffer  # noqa: B018
+
+
 # ---------------------------------------------------------------- numbers
 
 
@@ -263,47 +289,75 @@ def test_millidegrees_with_one_decimal(value, text):
 # ---------------------------------------------------------------- set-up
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        {},
-        {"height": 32},
-        {"sh1106": True},
-        {"width": 64, "height": 48},
-        {"width": 16, "height": 16},
-        {"rotate": 180},
-        {"sh1106": True, "rotate": 180},
-        {"height": 32, "rotate": 180},
-        {"chunk": 128},
-        {"chunk": 8},
-    ],
-)
-def test_every_kind_of_panel_shows_the_buffer(kind):
-    chip, _bus, d = bench(**kind)
-    assert chip.lit and not any(chip.frame()), "cleared before it was lit"
+def drawn(d):
+    """The display with something at its corners, sent."""
     d.text("Wy\u00b0", 1, 1, LARGE)
     d.fill_rect(d.width - 3, d.height - 2, 3, 2)
     d.show()
     assert d.flush()
+    return rows(d)
+
+
+# column of the left edge, COM wiring (micropython-lib's ssd1306.py; u8g2's u8x8_d_ssd1306_*.c and u8x8_d_sh1106_*.c)
+PANELS = {
+    "SSD1306 128x64": (0, 0x12),
+    "SSD1306 128x32": (0, 0x02),
+    "SSD1306 96x16": (0, 0x02),
+    "SSD1306 72x40": (28, 0x12),
+    "SSD1306 64x48": (32, 0x12),
+    "SSD1306 64x32": (32, 0x12),
+    "SH1106 128x64": (2, 0x12),
+    "SH1106 128x32": (2, 0x02),
+    "SSD1306 16x16": (56, 0x12),
+}
+
+
+@pytest.mark.parametrize("options", [{}, {"rotate": 180}, {"chunk": 128}, {"chunk": 8}], ids=str)
+@pytest.mark.parametrize("panel", PANELS)
+def test_every_panel_shows_the_buffer(panel, options):
+    chip, _bus, d = bench(panel, **options)
+    assert chip.lit and not chip.dim and not any(chip.frame()), "cleared before it was lit"
+    buffer = drawn(d)
     seen = chip.picture()
-    if "rotate" in kind:
+    if "rotate" in options:
         seen = [row[::-1] for row in seen[::-1]]
-    assert seen == rows(d) and chip.errors == []
+    assert seen == buffer and chip.errors == []
+    assert chip.com_pins == PANELS[panel][1]
 
 
-def test_the_wrong_kind_of_controller_is_not_forgiven():
-    """The failing twin: an SH1106 behind a display object for the SSD1306."""
+@pytest.mark.parametrize("panel", PANELS)
+def test_a_panel_elsewhere_than_it_is_wired_shows_a_part(panel):
+    column, _pins = PANELS[panel]
+    right = bench(panel, column_offset=column)[::2]
+    assert drawn(right[1]) == right[0].picture()
+    wrong = column + 8 if column < 8 else column - 8
+    spare = (132 if panel.startswith("SH") else 128) - right[1].width
+    if wrong <= spare:
+        chip, _bus, d = bench(panel, column_offset=wrong)
+        assert drawn(d) != chip.picture()
+
+
+def test_a_1_3_inch_sh1106_taken_for_an_ssd1306_is_shifted_by_two_columns_with_noise_at_the_edge():
     chip = SSD1306Chip(sh1106=True)
-    d = ssd1306.SSD1306_I2C(ChipBus(chip))
+    d = ssd1306.SSD1306(ChipBus(chip))
     d.begin()
-    assert chip.errors
+    buffer, seen = drawn(d), chip.picture()
+    assert chip.errors and [row[:126] for row in seen] == [row[2:] for row in buffer]
+    assert any(row[126] for row in seen) and any(row[127] for row in seen)
+
+
+def test_a_small_panel_without_the_internal_current_is_dim():
+    """The failing twin: the set-up of a large panel on the same controller."""
+    chip = SSD1306Chip(width=72, height=40)
+    ssd1306.SSD1306(ChipBus(chip), "SSD1306 128x64").begin()
+    assert chip.lit and chip.dim
 
 
 def test_spi_with_reset_and_chip_select_through_the_machine():
     chip = SSD1306Chip()
     machine.wire_spi(1, chip, cs=5, dc=6, rst=7)
     pins = [machine.Pin(n, machine.Pin.OUT) for n in (6, 7, 5)]
-    d = ssd1306.SSD1306_SPI(machine.SPI(1, baudrate=10_000_000), *pins)
+    d = ssd1306.SSD1306(machine.SPI(1, baudrate=10_000_000), "SSD1306 128x64", 0x3C, *pins)
     d.begin()
     d.text("SPI", 10, 20, LARGE)
     d.show()
@@ -314,7 +368,7 @@ def test_spi_with_reset_and_chip_select_through_the_machine():
 def test_spi_without_chip_select_and_reset():
     chip = SSD1306Chip()
     machine.wire_spi(1, chip, dc=6)
-    d = ssd1306.SSD1306_SPI(machine.SPI(1, baudrate=1_000_000), machine.Pin(6, machine.Pin.OUT))
+    d = ssd1306.SSD1306(machine.SPI(1, baudrate=1_000_000), dc=machine.Pin(6, machine.Pin.OUT))
     d.begin()
     assert chip.lit and chip.errors == []
 
@@ -324,7 +378,7 @@ def test_i2c_through_the_machine_takes_the_time_that_the_docstring_says():
 
     chip = SSD1306Chip()
     machine.wire_i2c(0, chip)
-    d = ssd1306.SSD1306_I2C(machine.I2C(0, freq=400_000), refresh=False)
+    d = ssd1306.SSD1306(machine.I2C(0, freq=400_000), refresh=False)
     d.begin()
     d.fill(1)
     d.show()
@@ -337,27 +391,61 @@ def test_i2c_through_the_machine_takes_the_time_that_the_docstring_says():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"width": 130}, "width"),
-        ({"width": 136}, "width"),
-        ({"height": 12}, "height"),
-        ({"height": 8}, "height"),
-        ({"height": 72}, "height"),
+        ({"panel": "SSD1306 130x64"}, "width"),
+        ({"panel": "SSD1306 136x64"}, "width"),
+        ({"panel": "SSD1306 128x12"}, "height"),
+        ({"panel": "SSD1306 128x8"}, "height"),
+        ({"panel": "SSD1306 128x72"}, "height"),
+        ({"panel": "SSD1322 256x64"}, "SH1106 128x64.*SSD1322 256x64"),
+        ({"panel": "128x64"}, "name the panel"),
+        ({"panel": "SSD1306 128"}, "name the panel"),
+        ({"panel": None}, "name the panel"),
         ({"chunk": 0}, "chunk"),
         ({"chunk": 33}, "chunk"),
         ({"rotate": 90}, "rotate"),
+        ({"column_offset": 1}, "column_offset must be 0 to 0"),
+        ({"panel": "SH1106 128x64", "column_offset": 5}, "0 to 4"),
+        ({"address": 0x78}, "0x78 is the 8-bit form.*pass 0x3C"),
+        ({"address": 0x7A}, "0x7A is the 8-bit form.*pass 0x3D"),
+        ({"address": 0x68}, "0x3C or 0x3D"),
+        ({"width": 128}, 'call SSD1306\\(bus, "SSD1306 128x64"\\)'),
+        ({"addr": 0x3C}, "address="),
     ],
 )
 def test_what_cannot_be_is_refused(options, words):
     with pytest.raises(ValueError, match=words):
-        ssd1306.SSD1306_I2C(None, **options)
+        ssd1306.SSD1306(ChipBus(None), **options)
 
 
-def test_an_absent_display_is_a_clear_error():
-    _chip, _bus, d = bench(begin=False, address=0x3D)
-    with pytest.raises(OSError, match=r"0x3C.*0x3D") as why:
+@pytest.mark.parametrize("name", ["SSD1306", "SSD1306_I2C", "SSD1306_SPI"])
+def test_a_call_as_of_micropython_libs_driver_is_told_how_it_is_here(name):
+    bus = ChipBus(None)
+    for arguments in ((128, 64, bus), (128, 64, bus, 0x3C), (128, 64, bus, None, None, None)):
+        with pytest.raises(ValueError, match=r'SSD1306\(bus, "SSD1306 128x64"\).*first the bus'):
+            getattr(ssd1306, name)(*arguments)
+
+
+def test_a_bus_that_is_spi_wants_to_know_its_data_pin():
+    with pytest.raises(ValueError, match="dc="):
+        ssd1306.SSD1306(machine.SPI(1))
+
+
+@pytest.mark.parametrize("address", [0x3C, 0x3D])
+def test_an_absent_display_is_a_clear_error(address):
+    chip, _bus, d = bench(begin=False, address=address)
+    chip.vanish()
+    text = f"no display answers at 0x{address:02X} .nor at 0x{address ^ 1:02X}.: check VCC"
+    with pytest.raises(ssd1306.DisplayError, match=text) as why:
         d.begin()
-    assert isinstance(why.value, ssd1306.DisplayError)
-    assert d.lost and not d.busy
+    assert isinstance(why.value, OSError)
+    assert d.lost and not d.busy and d.errors == 1
+
+
+def test_a_display_at_the_other_address_is_named():
+    chip, _bus, d = bench(begin=False, chip_address=0x3D)
+    with pytest.raises(ssd1306.DisplayError, match=r"0x3C, but one does at 0x3D: pass .* address="):
+        d.begin()
+    assert chip.errors == []
 
 
 @pytest.mark.parametrize("after", range(0, 40, 3))
@@ -463,9 +551,9 @@ STEPS = st.lists(
 
 
 @settings(max_examples=200, deadline=None)
-@given(STEPS, st.booleans(), st.sampled_from((8, 32)))
-def test_whatever_happens_the_display_comes_to_show_the_buffer(steps, sh1106, chunk):
-    chip, _bus, d = bench(sh1106=sh1106, chunk=chunk)
+@given(STEPS, st.sampled_from(("SSD1306 128x64", "SH1106 128x64")), st.sampled_from((8, 32)))
+def test_whatever_happens_the_display_comes_to_show_the_buffer(steps, panel, chunk):
+    chip, _bus, d = bench(panel, chunk=chunk)
     for name, *arguments in steps:
         if name == "nack":
             chip.nack_next(arguments[0], after=arguments[1])
@@ -541,7 +629,7 @@ def test_an_interrupt_that_flushes_may_come_anywhere_in_show_and_drawing():
     lines = None
     at = 0
     while lines is None or at < lines:
-        chip, _bus, d = bench(width=16, height=16, chunk=8)
+        chip, _bus, d = bench("SSD1306 16x16", chunk=8)
         d.fill_rect(0, 0, 16, 9)
         d.show()
         d.flush_step(8)

@@ -20,7 +20,8 @@ def sensor():
 
 
 def display(chunk):
-    return ssd1306.SSD1306_I2C(_i2c, chunk=chunk)
+    # the panel by name; README.md lists them ("SH1106 128x64" is the usual 1.3 inch one)
+    return ssd1306.SSD1306(_i2c, "SSD1306 128x64", chunk=chunk)
 
 
 def data_ready_pin():

@@ -32,7 +32,7 @@ _TICK_TIMER = 7
 
 # SPI1 and SPI5 hang on APB2 (84 MHz) behind a power of two from 2 to 256: 1 MHz asked for is 656 kHz, 20 MHz is 10.5.
 _IMU_HZ = 1000000
-_OLED_HZ = 5250000  # the SSD1306 stands 10 MHz
+_OLED_HZ = 5250000  # an SSD1306 takes up to 10 MHz, an SH1106 up to 2 MHz
 
 _imu_spi = SPI(5, baudrate=_IMU_HZ)
 _imu_select = Pin("PF6", Pin.OUT, value=1)
@@ -53,8 +53,10 @@ def magnetometer(imu):
 
 
 def display(chunk):
-    return ssd1306.SSD1306_SPI(
+    # the panel by name; README.md lists them
+    return ssd1306.SSD1306(
         SPI(1, baudrate=_OLED_HZ),
+        "SSD1306 128x64",
         dc=Pin("PB9", Pin.OUT, value=0),
         rst=Pin("PB10", Pin.OUT, value=1),
         chunk=chunk,

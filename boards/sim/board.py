@@ -18,7 +18,7 @@ def sensor():
 
 def display(chunk):
     own = None if DISPLAY_SHARES_BUS else I2C(1, scl=Pin(19), sda=Pin(18), freq=400000)
-    return ssd1306.SSD1306_I2C(own or _i2c, chunk=chunk)
+    return ssd1306.SSD1306(own or _i2c, "SSD1306 128x64", chunk=chunk)
 
 
 def data_ready_pin():

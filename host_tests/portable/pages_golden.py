@@ -18,7 +18,8 @@ class Bench:
         machine.power_on()
         self.chip = SSD1306Chip(height=height, sh1106=sh1106)
         machine.wire_i2c(0, self.chip)
-        self.display = ssd1306.SSD1306_I2C(machine.I2C(0), height=height, sh1106=sh1106)
+        panel = "%s 128x%d" % ("SH1106" if sh1106 else "SSD1306", height)
+        self.display = ssd1306.SSD1306(machine.I2C(0), panel)
         self.display.begin()
         self.pages = pages.Pages(self.display)
 

@@ -95,7 +95,7 @@ def measure(display, name, locked):
 
 
 # raising an exception takes heap for its traceback where there is any, so failures only when locked
-measure(ssd1306.SSD1306_I2C(Bus(True)), "i2c-locked", True)
-measure(ssd1306.SSD1306_I2C(Bus(False)), "i2c-free", False)
+measure(ssd1306.SSD1306(Bus(True)), "i2c-locked", True)
+measure(ssd1306.SSD1306(Bus(False)), "i2c-free", False)
 pins = Pins()
-measure(ssd1306.SSD1306_SPI(pins, pins, cs=pins, height=32), "spi-locked", True)
+measure(ssd1306.SSD1306(pins, "SSD1306 128x32", dc=pins, cs=pins), "spi-locked", True)

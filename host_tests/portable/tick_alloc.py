@@ -17,7 +17,7 @@ from upright.ist8310 import IST8310  # noqa: E402
 from upright.mahony import Mahony6, Mahony9  # noqa: E402
 from upright.mpu6050 import MPU6050  # noqa: E402
 from upright.mpu6500 import MPU6500  # noqa: E402
-from upright.ssd1306 import SSD1306_I2C  # noqa: E402
+from upright.ssd1306 import SSD1306  # noqa: E402
 
 TICKS = 10000
 
@@ -124,7 +124,7 @@ def build(kind):
     imu = MPU6050(bus)
     imu.configure(settle=False)
     filter = kind(1000, imu.gyro_scale, imu.accel_lsb_per_g, 0.5, 0.01)
-    display = SSD1306_I2C(bus)
+    display = SSD1306(bus)
     display.begin()
     # ticks_us runs on: whether ticks were missed does not matter, coasting may not allocate either
     return bus, imu, display, ticks.Tick(imu, filter, 1000, display, 32)
@@ -140,7 +140,7 @@ def build_nine():
     calibration = Calibration(
         ("x", "y", "z"), ("y", "-x", "-z"), imu.accel_lsb_per_g, imu.gyro_scale
     )
-    display = SSD1306_I2C(Bus())
+    display = SSD1306(Bus())
     display.begin()
     tick = ticks.Tick(imu, filter, 1000, display, 32, calibration=calibration)
     return bus, imu, display, tick, mag

@@ -30,7 +30,7 @@ FILTERS_ONLY = sys.argv[3:] == ["filters"]  # a trace is slow, its start too
 if not FILTERS_ONLY:
     from upright.calibration import Calibration
     from upright.mpu6050 import MPU6050
-    from upright.ssd1306 import SSD1306_I2C
+    from upright.ssd1306 import SSD1306
     from upright.tick import Tick
 
 RATE = 200
@@ -131,7 +131,7 @@ if not FILTERS_ONLY:
     imu.read()
     turned = Calibration(("y", "-x", "z"), ("x", "y", "-z"), ACCEL_LSB_PER_G, GYRO_SCALE)
     display_bus.writeto = quick_write
-    display = SSD1306_I2C(display_bus, refresh=False)
+    display = SSD1306(display_bus, refresh=False)
     display.begin()
 
 
