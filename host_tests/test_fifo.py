@@ -132,7 +132,7 @@ def test_without_the_look_at_the_overflow_flag_packets_would_be_misaligned():
     _, imu = running()
 
     def careless(n, fraction):
-        imu._read_into(0x74, imu._views[n])
+        imu.registers.read_into(0x74, imu._views[n])
         imu._at, imu._pending = 0, n
         return n
 
@@ -268,7 +268,8 @@ class Hostile:
 
 def test_a_burst_cut_off_and_a_restart_that_fails_too_leave_no_half_packet_behind():
     chip, imu = running()
-    imu._i2c = bus = Hostile(chip, kernel.now() + 5000, [])
+    bus = Hostile(chip, kernel.now() + 5000, [])
+    imu.registers.bind(bus)
     before = drain(imu)
     bus.now += 5000
     bus.plan = [(0, 25, ("nack", 0)), (0, 25, ("cut", 33)), (0, 25, None)]  # taken from the end
@@ -316,7 +317,8 @@ def test_no_misaligned_packet_whatever_happens_between_any_two_transactions(
     machine.power_on()
     chip, imu = running(batch, fifo_byte_us=byte_us)
     chip.power_up_us = restart_us  # 0: a dip so short that the chip never stops answering
-    imu._i2c = bus = Hostile(chip, kernel.now(), plan)
+    bus = Hostile(chip, kernel.now(), plan)
+    imu.registers.bind(bus)
     last = -1
 
     def step():

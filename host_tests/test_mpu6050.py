@@ -346,7 +346,7 @@ class Broken:
 @pytest.mark.parametrize("error", [OSError(5), OSError(19), OSError(110), OSError("custom")])
 def test_any_bus_error_is_survived_whatever_the_port_calls_it(error):
     _, imu = running()
-    imu._i2c = Broken(error)
+    imu.registers.bind(Broken(error))
     imu.errors = (1 << 30) - 2
     assert [imu.read(), imu.health(), imu.read()] == [0, HEALTH_BUS_ERROR, 0]
     assert imu.errors == 1  # the counter wraps within a small int
@@ -354,7 +354,7 @@ def test_any_bus_error_is_survived_whatever_the_port_calls_it(error):
 
 def test_other_errors_are_not_hidden():
     _, imu = running()
-    imu._i2c = Broken(TypeError())
+    imu.registers.bind(Broken(TypeError()))
     with pytest.raises(TypeError):
         imu.read()
 
@@ -365,15 +365,18 @@ def test_other_errors_are_not_hidden():
 def test_health_reads_one_register_a_call_and_all_of_them_in_turn():
     _, imu = running()
     read = []
-    real = imu._i2c.readfrom_mem_into
+    real = machine.I2C(0).readfrom_mem_into
 
     class Spy:
         def readfrom_mem_into(self, address, register, buffer):
             read.append((register, len(buffer)))
             real(address, register, buffer)
 
-    imu._i2c = Spy()
-    rows = imu.registers()
+        def writeto(self, address, buffer):
+            raise AssertionError
+
+    imu.registers.bind(Spy())
+    rows = imu.configuration()
     assert {imu.health() for _ in range(2 * len(rows))} == {HEALTH_OK}
     assert read == [(register, 1) for register, _ in rows] * 2
 
@@ -381,9 +384,9 @@ def test_health_reads_one_register_a_call_and_all_of_them_in_turn():
 @pytest.mark.parametrize("row", range(10))
 def test_any_changed_register_is_found_within_one_round(row):
     chip, imu = running()
-    register, value = imu.registers()[row]
+    register, value = imu.configuration()[row]
     chip.poke(register, value ^ 0x20)
-    states = [imu.health() for _ in range(len(imu.registers()))]
+    states = [imu.health() for _ in range(len(imu.configuration()))]
     assert states.count(HEALTH_MISMATCH) == 1
     for _ in range(imu.repair_calls):
         imu.health()
@@ -427,8 +430,8 @@ def test_a_brown_out_is_repaired_in_the_promised_calls_and_no_wrong_sample_is_fr
     assert calls <= imu.repair_calls
     assert seen and all(counts == good for counts in seen)  # neither another scale nor start-up
     assert not any(register == PWR_MGMT_1 and value & 0x80 for _, register, value in log)
-    assert [(register, chip.register(register)) for register, _ in imu.registers()] == (
-        imu.registers()
+    assert [(register, chip.register(register)) for register, _ in imu.configuration()] == (
+        imu.configuration()
     )
 
 
@@ -482,7 +485,7 @@ def test_slow_samples_do_not_keep_health_from_the_other_registers():
     chip, imu = running(rate=50)
     chip.poke(GYRO_CONFIG, 0)
     states = []
-    for _ in range(3 * len(imu.registers())):
+    for _ in range(3 * len(imu.configuration())):
         tick(imu)
         states.append(imu.health())
     assert HEALTH_MISMATCH in states
@@ -496,8 +499,8 @@ def test_self_test_passes_on_a_sound_chip_and_restores_the_configuration():
     passed, changes = imu.self_test()
     assert passed is True
     assert all(abs(change) <= 2 for change in changes)
-    assert [(register, chip.register(register)) for register, _ in imu.registers()] == (
-        imu.registers()
+    assert [(register, chip.register(register)) for register, _ in imu.configuration()] == (
+        imu.configuration()
     )
     assert tick(imu, 5000) & FRESH
 

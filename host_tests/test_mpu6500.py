@@ -255,16 +255,17 @@ def test_only_sensor_bursts_are_fast():
 
 
 def test_the_clock_is_changed_only_when_it_has_to_be():
-    _chip, imu = running(spi=Spy(machine.SPI(5)))
+    spy = Spy(machine.SPI(5))
+    _chip, imu = running(spi=spy)
     tick(imu)
-    before = imu._spi.inits
+    before = spy.inits
     for _ in range(100):
         tick(imu)
-    assert imu._spi.inits == before
+    assert spy.inits == before
     imu.health()
     imu.health()
     tick(imu)
-    assert imu._spi.inits == before + 2
+    assert spy.inits == before + 2
 
 
 def test_asked_clocks_are_used():
@@ -345,7 +346,7 @@ def test_a_bus_that_cannot_be_clocked_keeps_the_clock_that_it_was_made_with(kind
 
 def test_without_the_second_clock_the_chip_would_be_misused():
     chip, imu = running()
-    imu._slow_hz = 10_000_000
+    imu.registers.slow_hz = 10_000_000
     imu.health()
     assert any("10000000 Hz" in what for what in chip.misuse)
 
@@ -458,10 +459,11 @@ class Fault:
 
 @pytest.mark.parametrize("level", [0x00, 0xFF])
 def test_a_miso_that_sticks_is_counted_and_no_sample_comes_of_it(level):
-    chip, imu = running(spi=Fault(machine.SPI(5)))
+    wire = Fault(machine.SPI(5))
+    chip, imu = running(spi=wire)
     tick(imu)
     good = list(imu.counts)[:10]
-    imu._spi.level = level
+    wire.level = level
     states = set()
     for _ in range(50):
         assert tick(imu) == 0
@@ -469,7 +471,7 @@ def test_a_miso_that_sticks_is_counted_and_no_sample_comes_of_it(level):
     assert list(imu.counts) == [*good, 0]
     assert states == {HEALTH_BUS_ERROR}  # the line, not the chip
     assert imu.errors >= 50 and imu.resets == 0
-    imu._spi.level = None
+    wire.level = None
     assert tick(imu) == FRESH
     for _ in range(60):
         assert imu.health() == HEALTH_OK
@@ -492,22 +494,24 @@ def test_a_chip_that_vanishes_is_counted_and_comes_back_by_itself():
 
 @pytest.mark.parametrize("error", [OSError(5), OSError(110), OSError("custom")])
 def test_a_bus_that_raises_is_survived_and_the_chip_is_let_go(error):
-    _, imu = running(spi=Fault(machine.SPI(5)))
-    imu._spi.error = error
+    wire = Fault(machine.SPI(5))
+    _, imu = running(spi=wire)
+    wire.error = error
     imu.errors = (1 << 30) - 2
     assert [imu.read(), imu.health(), imu.read()] == [0, HEALTH_BUS_ERROR, 0]
     assert imu.errors == 1 and not selected()
-    imu._spi.error = None
+    wire.error = None
     assert tick(imu) == FRESH
 
 
 def test_cs_is_high_again_even_after_what_is_not_survived():
-    _, imu = running(spi=Fault(machine.SPI(5)))
-    imu._spi.error = TypeError()
+    wire = Fault(machine.SPI(5))
+    _, imu = running(spi=wire)
+    wire.error = TypeError()
     with pytest.raises(TypeError):
         imu.read()
     with pytest.raises(TypeError):
-        imu._write(0x6B, 1)
+        imu.registers.write(0x6B, 1)
     assert not selected()
 
 
@@ -521,8 +525,10 @@ def test_a_clock_that_could_not_be_changed_is_set_again_before_the_next_access()
         raise OSError(5)
 
     spy.init = refuse
+    imu.registers.bind(spy)
     assert imu.read() == 0 and imu.errors == 1
     spy.init = real
+    imu.registers.bind(spy)
     assert tick(imu) == FRESH and imu.health() == HEALTH_OK
     assert chip.misuse == []
 
@@ -583,7 +589,7 @@ def test_a_changed_register_of_others_is_found_and_put_right():
     imu.set_rows([(0x25, 0x8E, 0xFF), (0x34, 9, 0x1F)])
     imu._hold = 0
     chip.poke(0x25, 0x0C)
-    states = [imu.health() for _ in range(len(imu.registers()))]
+    states = [imu.health() for _ in range(len(imu.configuration()))]
     assert states.count(HEALTH_MISMATCH) == 1
     for _ in range(imu.repair_calls):
         imu.health()
@@ -601,10 +607,10 @@ def test_bits_that_the_mask_leaves_out_are_nobodys_business():
 
 def test_set_rows_changes_a_row_in_place_and_puts_a_new_one_before_user_ctrl():
     chip, imu = running()
-    before = imu.registers()
+    before = imu.configuration()
     calls = imu.repair_calls
     imu.set_rows([(0x67, 0x81, 0xFF), (0x19, 1, 0xFF)])
-    after = imu.registers()
+    after = imu.configuration()
     assert after == [(0x19, 1) if row[0] == 0x19 else row for row in before[:-1]] + [
         (0x67, 0x81),
         before[-1],
@@ -612,9 +618,9 @@ def test_set_rows_changes_a_row_in_place_and_puts_a_new_one_before_user_ctrl():
     assert imu.repair_calls == calls + 2
     assert chip.register(0x67) == 0x81
     imu.set_rows([(0x67, 0x82, 0xFF)])
-    assert len(imu.registers()) == len(after) and chip.register(0x67) == 0x82
+    assert len(imu.configuration()) == len(after) and chip.register(0x67) == 0x82
     imu.configure()
-    assert imu.registers() == before and imu.repair_calls == calls
+    assert imu.configuration() == before and imu.repair_calls == calls
 
 
 def test_a_row_that_does_not_hold_is_reported_by_its_name():
@@ -628,8 +634,9 @@ def test_single_registers_can_be_read_and_written():
     chip, imu = running()
     imu.write_register(0x63, 0x5A)
     assert imu.read_register(0x63) == 0x5A == chip.register(0x63)
-    imu._spi = Fault(imu._spi)
-    imu._spi.error = OSError(5)
+    wire = Fault(machine.SPI(5))
+    imu.registers.bind(wire)
+    wire.error = OSError(5)
     with pytest.raises(imu.error_class, match=r"reading WHO_AM_I \(0x75\)"):
         imu.read_register(WHO_AM_I)
 
@@ -713,7 +720,7 @@ def test_slow_samples_keep_neither_ext_nor_the_registers_from_their_turn():
     chip, imu, ext = attached(rate=20)
     chip.poke(GYRO_CONFIG, 0)
     states = []
-    for _ in range(4 * len(imu.registers()) + 4):
+    for _ in range(4 * len(imu.configuration()) + 4):
         tick(imu)
         states.append(imu.health())
     assert HEALTH_MISMATCH in states and ext.looks >= 5
@@ -753,7 +760,7 @@ def test_self_test_passes_on_a_sound_chip_and_restores_the_configuration(options
     passed, changes = imu.self_test()
     assert passed is True
     assert all(abs(change) <= 2 for change in changes)
-    for register, value in imu.registers():
+    for register, value in imu.configuration():
         assert chip.register(register) == value & (0xEF if register == USER_CTRL else 0xFF)
     assert tick(imu, 5000) & FRESH and chip.misuse == []
 

@@ -43,7 +43,6 @@ _EXT_BYTES = const(24)
 _LONGEST = const(15)
 _SLV4_BITS = const(39)  # clocks of the longest transaction of slot 4, a read of one byte
 _POLLS = const(16)  # calls of poll() that a transaction may take
-_COUNT_MASK = const(0x3FFFFFFF)
 
 # Steps of a transaction: what poll() does next
 _NOTHING = const(0)
@@ -110,7 +109,7 @@ class AuxiliaryBus:
     @property
     def running(self):
         """True once begin() is through, and until imu.configure()."""
-        return bool(self._imu._user_ctrl & _I2C_MST_EN)
+        return self._imu.master_enabled
 
     def begin(self):
         """Switch the master on: 400 kHz, no slot in use.
@@ -380,7 +379,7 @@ class AuxiliaryBus:
     @micropython.native
     def _read(self, register):
         try:
-            self._imu._read_into(register, self._one)
+            self._imu.registers.read_into(register, self._one)
             return 1
         except OSError:
             return self._fault()
@@ -388,15 +387,13 @@ class AuxiliaryBus:
     @micropython.native
     def _write(self, register, value):
         try:
-            self._imu._write(register, value)
+            self._imu.registers.write(register, value)
             return 1
         except OSError:
             return self._fault()
 
     def _fault(self):
-        imu = self._imu
-        imu.errors = (imu.errors + 1) & _COUNT_MASK
-        imu._suspect = 1
+        self._imu.bus_fault()
         return 0
 
 

@@ -128,7 +128,9 @@ class MpuDmpSetup(Attitude):
         imu = self._imu
         imu.configure(accel_range_g=2, gyro_range_dps=2000, sample_rate_hz=_BASE_HZ)
         two = bytearray(2)
-        imu._set_up_read(_TEMP_OUT_H, two)  # packets have no temperature: it stays as it was now
+        imu.registers.read_registers(
+            _TEMP_OUT_H, two
+        )  # packets have no temperature: it stays as it was now
         self.counts[9] = ((two[0] << 8 | two[1]) ^ 0x8000) - 0x8000
         self._load()
         whole = memoryview(bytearray(self._batch_max * self._packet))
@@ -174,7 +176,7 @@ class MpuDmpSetup(Attitude):
     def _write(self, register, data):
         """A burst; raises MpuDmpError."""
         try:
-            self._imu._write_from(bytes((register,)) + data)
+            self._imu.registers.write_from(bytes((register,)) + data)
             return
         except OSError as e:
             fault = e
@@ -194,7 +196,7 @@ class MpuDmpSetup(Attitude):
         found = bytearray(len(data))
         try:
             self._point(address)
-            self._imu._read_into(_MEM_R_W, found)
+            self._imu.registers.read_into(_MEM_R_W, found)
         except OSError as e:
             raise MpuDmpError(
                 "reading back the DMP's bank %d at 0x%02x: %s" % (_at(address) + (e,))

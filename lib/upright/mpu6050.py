@@ -4,7 +4,6 @@
 
 import time
 
-import micropython
 from micropython import const
 
 from upright import mpu_parts
@@ -15,6 +14,7 @@ from upright.mpu_common import (  # noqa: F401  the health states are part of th
     HEALTH_REPAIRING,
     MpuBase,
 )
+from upright.registers import I2CRegisters
 
 _WHO_AM_I = const(0x75)
 
@@ -53,40 +53,21 @@ class MPU6050(MpuBase):
     _ONLY_6500 = False
 
     def __init__(self, i2c, address=0x68, accept_unknown=False):
-        MpuBase.__init__(self)
+        MpuBase.__init__(self, I2CRegisters(i2c, address, self.error_class, mpu_parts.name))
         self._i2c = i2c
-        self._address = address
         self._accept_unknown = accept_unknown
-        self._out = bytearray(2)
-
-    # The bus, in the tick too: writeto of a prebuilt buffer, as writeto_mem allocates on several ports
-
-    @micropython.native
-    def _read_into(self, register, buffer):
-        self._i2c.readfrom_mem_into(self._address, register, buffer)
-
-    @micropython.native
-    def _write(self, register, value):
-        out = self._out
-        out[0] = register
-        out[1] = value
-        self._i2c.writeto(self._address, out)
-
-    def _write_from(self, buffer):
-        """A burst: buffer[0] is the register, the others go into it and the next ones."""
-        self._i2c.writeto(self._address, buffer)
 
     # Set-up
 
     def _begin(self):
         self._identify()
-        self._reset(f"at 0x{self._address:02x}")
+        self._reset(f"at 0x{self.registers.address:02x}")
         self._identify()
 
     def _identify(self):
         who = None
         for _ in range(11):
-            who = self._who_is_at(self._address)
+            who = self._who_is_at(self.registers.address)
             if who is not None:
                 break
             time.sleep_ms(10)  # just powered up, the chip may take 100 ms to answer
@@ -97,7 +78,7 @@ class MPU6050(MpuBase):
             if not self._accept_unknown:
                 known = ", ".join(f"0x{k:02x}" for k in sorted(mpu_parts.PARTS))
                 raise self.error_class(
-                    f"0x{self._address:02x} answers WHO_AM_I (0x75) with 0x{who:02x}; known are "
+                    f"0x{self.registers.address:02x} answers WHO_AM_I (0x75) with 0x{who:02x}; known are "
                     f"{known}. A DS1307 or DS3231 clock has the same address. "
                     f"accept_unknown=True uses it as an {self._NAME}"
                 )
@@ -105,23 +86,24 @@ class MPU6050(MpuBase):
             part = (f"unknown (0x{who:02x})",) + as_if[1:]
         elif self._ONLY_6500 and not part[1]:
             raise self.error_class(
-                f"0x{self._address:02x} is an {part[0]} (0x{who:02x}), not of the MPU6500 family: "
+                f"0x{self.registers.address:02x} is an {part[0]} (0x{who:02x}), not of the MPU6500 family: "
                 "use MPU6050, which drives both"
             )
         self._adopt(who, part)
 
     def _who_is_at(self, address):
+        registers = I2CRegisters(self._i2c, address)
         try:
-            self._i2c.readfrom_mem_into(address, _WHO_AM_I, self._one)
+            registers.read_into(_WHO_AM_I, self._one)
         except OSError:
             return None
         return self._one[0]
 
     def _absent(self):
-        other = 0x69 if self._address == 0x68 else 0x68
+        other = 0x69 if self.registers.address == 0x68 else 0x68
         who = self._who_is_at(other)
         if who is None:
             hint = f"none at 0x{other:02x} either. Check supply, SDA, SCL and their pull-ups"
         else:
             hint = f"0x{other:02x} answers, with 0x{who:02x}. AD0 sets the address: low 0x68, high 0x69"
-        return f"no {self._NAME} at 0x{self._address:02x}; {hint} (WHO_AM_I: no answer to 11 reads in 0.1 s)"
+        return f"no {self._NAME} at 0x{self.registers.address:02x}; {hint} (WHO_AM_I: no answer to 11 reads in 0.1 s)"

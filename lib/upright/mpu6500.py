@@ -4,7 +4,6 @@
 
 import time
 
-import micropython
 from micropython import const
 
 from upright import mpu_parts
@@ -16,6 +15,7 @@ from upright.mpu_common import (  # noqa: F401  the health states are part of th
     HEALTH_REPAIRING,
     MpuBase,
 )
+from upright.registers import SPIRegisters
 
 _INT_STATUS = const(0x3A)
 _EXT_SENS_DATA_23 = const(0x60)
@@ -24,8 +24,6 @@ _USER_CTRL = const(0x6A)
 _WHO_AM_I = const(0x75)
 
 _I2C_IF_DIS = const(0x10)
-_READ = const(0x80)  # first bit of the address byte, PS 7.5
-_IDLE = const(0xFF)  # sent while reading: should the chip take it for an address, it is a read
 _REGISTER_HZ = const(1_000_000)  # PS 6.5: every register
 _SENSOR_HZ = const(20_000_000)  # PS 6.5: reading sensor and interrupt registers
 
@@ -73,121 +71,33 @@ class MPU6500(MpuBase):
             raise ValueError(f"slow_hz {slow_hz!r} is not 1 to {_REGISTER_HZ}")
         if not slow_hz <= fast_hz <= _SENSOR_HZ:
             raise ValueError(f"fast_hz {fast_hz!r} is not {slow_hz} to {_SENSOR_HZ}")
-        MpuBase.__init__(self)
-        self._spi = spi
-        self._cs = cs
+        MpuBase.__init__(
+            self,
+            SPIRegisters(
+                spi,
+                cs,
+                fast_hz,
+                slow_hz,
+                (_INT_STATUS, _EXT_SENS_DATA_23),  # not FIFO_R_W: no sensor register
+                self.error_class,
+                mpu_parts.name,
+            ),
+        )
         self._accept_unknown = accept_unknown
-        self._slow_hz = slow_hz
-        self._fast_hz = fast_hz
-        self.burst_hz = 0  # while 0 the clock is left alone
-        self._hz = 0  # what the bus runs at
-        self._head = bytearray(1)
-        self._out = bytearray(2)
 
-    # The bus, in the tick too
-
-    @micropython.native
-    def _read_into(self, register, buffer):
-        n = len(buffer)
-        # for a byte or two another clock does not pay; FIFO_R_W is no sensor register
-        hz = self._slow_hz
-        if n > 2 and register >= _INT_STATUS and register + n <= _EXT_SENS_DATA_23 + 1:
-            hz = self.burst_hz
-        if hz != self._hz:
-            self._clock(hz)
-        self._head[0] = register | _READ
-        try:
-            self._cs(0)
-            self._spi.write(self._head)
-            self._spi.readinto(buffer, _IDLE)
-        finally:
-            self._cs(1)
-
-    @micropython.native
-    def _write(self, register, value):
-        if self._hz != self._slow_hz:
-            self._clock(self._slow_hz)
-        out = self._out
-        out[0] = register
-        out[1] = value
-        try:
-            self._cs(0)
-            self._spi.write(out)
-        finally:
-            self._cs(1)
-
-    def _write_from(self, buffer):
-        """A burst: buffer[0] is the register, the others go into it and the next ones."""
-        if self._hz != self._slow_hz:
-            self._clock(self._slow_hz)
-        try:
-            self._cs(0)
-            self._spi.write(buffer)
-        finally:
-            self._cs(1)
-
-    # What machine.SPI.init(baudrate=) does, by the ports' sources: stm32 (machine_spi.c, spi.c) leaves
-    # polarity and phase alone and takes the next lower power-of-two part of the peripheral's clock
-    # (84 MHz: 656 kHz for 1 MHz, 5.25 MHz for 10 MHz, 10.5 MHz for 20 MHz); it sets up pins and
-    # peripheral anew and so lets go of SCK for a moment, hence only while CS is high. rp2 sets nothing
-    # but the divider, again to the next lower rate. Neither allocates. esp32 tears the whole bus down.
-
-    @micropython.native
-    def _clock(self, hz):
-        if self.burst_hz:
-            self._hz = 0  # unknown, should it fail
-            self._spi.init(baudrate=hz)
-            self._hz = hz
-
-    def _find_clocks(self):
-        """Decide whether sensor bursts get a clock of their own."""
-        self.burst_hz = self._hz = 0
-        try:
-            self._spi.init(baudrate=self._slow_hz)
-        except Exception:  # whatever a port raises where it has no such method or argument
-            return
-        taken = self._try_clocks()
-        # a burst of 16 bytes must gain more than the way there and back costs
-        gain = 128_000_000 // self._slow_hz - 128_000_000 // self._fast_hz
-        if 0 <= taken <= gain:
-            self.burst_hz = self._fast_hz
-            self._hz = self._slow_hz
-        else:
-            self._spi.init(baudrate=self._slow_hz)
-            self.burst_hz = self._slow_hz
-            self._hz = self._slow_hz
-
-    def _try_clocks(self):
-        """Microseconds for fast and back to slow without a heap, -1 if that cannot be."""
-        spi = self._spi
-        fast, slow = self._fast_hz, self._slow_hz
-        now = time.ticks_us
-        begun = ended = 0
-        possible = True
-        micropython.heap_lock()
-        try:
-            spi.init(baudrate=fast)
-            spi.init(baudrate=slow)
-            begun = now()
-            spi.init(baudrate=fast)
-            spi.init(baudrate=slow)
-            ended = now()
-        except Exception:
-            possible = False
-        finally:
-            micropython.heap_unlock()
-        return time.ticks_diff(ended, begun) if possible else -1
+    @property
+    def burst_hz(self):
+        return self.registers.burst_hz
 
     # Set-up
 
     def _begin(self):
-        self._cs(1)
-        self._find_clocks()
+        self.registers.find_clocks()
         self._identify()
         # RM 4.28: over SPI both H_RESET and SIGNAL_PATH_RESET, each followed by 100 ms
         self._reset("on SPI")
-        self._set_up_write(_USER_CTRL, _I2C_IF_DIS)
-        self._set_up_write(_SIGNAL_PATH_RESET, 0x07)
+        self.registers.write_register(_USER_CTRL, _I2C_IF_DIS)
+        self.registers.write_register(_SIGNAL_PATH_RESET, 0x07)
         time.sleep_ms(100)
         self._identify()
 

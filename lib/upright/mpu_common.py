@@ -55,12 +55,10 @@ def unpack(raw: ptr8, at: int, counts: ptr16) -> int:
 class MpuBase(MpuSetup):
     """Everything that does not depend on the bus. A subclass brings:
 
-    _read_into(register, buffer)  fills the buffer from the register on; may raise OSError
-    _write(register, value)       one register; may raise OSError; like the other it allocates nothing
-    _begin()                      finds, identifies and resets the chip: sets chip, who_am_i,
-                                  family_6500, fifo_size and _temperature
-    error_class                   the exception class for faults at set-up
-    _INTERFACE                    the bits of USER_CTRL that its bus wants: I2C_IF_DIS or none
+    registers    I2CRegisters or SPIRegisters, handed to __init__
+    _begin()     finds, identifies and resets the chip: sets chip, who_am_i, family_6500, fifo_size and
+                 _temperature
+    _INTERFACE   the bits of USER_CTRL that its bus wants: I2C_IF_DIS or none
 
     What set-up and the tick share is not guarded: no method of the set-up while a tick is running.
     """
@@ -321,6 +319,10 @@ class MpuBase(MpuSetup):
         elif self._verifying:
             self._settled = (self._settled + 1) & _COUNT_MASK
         return self._not_fresh()
+
+    def bus_fault(self):
+        """Count a fault of the bus that somebody else has met at this chip, and have health() look at it."""
+        self._fault()
 
     def _fault(self):
         self.errors = (self.errors + 1) & _COUNT_MASK

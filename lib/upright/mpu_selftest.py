@@ -123,7 +123,7 @@ def _sums(imu, actuators, ranges, samples):
         # a sample a millisecond; a chip that gives none is not waited for without end
         for _ in range(20):
             time.sleep_ms(1)
-            imu._set_up_read(_INT_STATUS, raw)
+            imu.registers.read_registers(_INT_STATUS, raw)
             if raw[0] & 1:
                 break
         else:

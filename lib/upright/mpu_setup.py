@@ -45,7 +45,9 @@ class MpuSetup:
     # the bits of USER_CTRL that the bus wants: I2C_IF_DIS or none
     _INTERFACE = 0
 
-    def __init__(self):
+    def __init__(self, registers):
+        self.registers = registers
+        self.error_class = registers.error_class
         self.counts = array("h", bytes(22))  # ax ay az gx gy gz mx my mz temp flags
         self.errors = 0
         self.stale = 0
@@ -94,7 +96,9 @@ class MpuSetup:
         # MicroPython looks for a method among the attributes of the instance first, and a table of
         # attributes that is (nearly) full is searched from end to end, 1500 instructions for a call. So
         # what every tick calls stands in that table.
-        for name in ("read", "health", "fifo_next", "_read_into", "_write", "_compare"):
+        self._read_into = self.registers.read_into
+        self._write = self.registers.write
+        for name in ("read", "health", "fifo_next", "_compare"):
             setattr(self, name, getattr(self, name))
 
     def configure(
@@ -268,7 +272,7 @@ class MpuSetup:
         if self._fifo_on:
             self._dirty = 1  # what came in while the gyro settled is not wanted
 
-    def registers(self):
+    def configuration(self):
         """The configuration as a list of (register, value), in the order in which it is written."""
         return [(self._registers[i], self._values[i]) for i in range(len(self._registers))]
 
@@ -276,12 +280,11 @@ class MpuSetup:
 
     def read_register(self, register):
         """One register; raises error_class, naming it, when the bus fails."""
-        self._set_up_read(register, self._one)
-        return self._one[0]
+        return self.registers.read_register(register)
 
     def write_register(self, register, value):
         """Write one register that health() is not to watch; raises error_class, naming it."""
-        self._set_up_write(register, value)
+        self.registers.write_register(register, value)
 
     def set_rows(self, rows):
         """Configure registers and have health() watch them and a repair write them back.
@@ -311,9 +314,14 @@ class MpuSetup:
             self._pending = 0
             self._dirty = 1
         for register, value, _ in rows:
-            self._set_up_write(register, value)
+            self.registers.write_register(register, value)
         for register, _, _ in rows:
             self._verify(register)
+
+    @property
+    def master_enabled(self):
+        """Is the auxiliary master to run, as set_user_ctrl() has it?"""
+        return bool(self._user_ctrl & _I2C_MST_EN)
 
     def set_user_ctrl(self, bits, mask):
         """Change the bits of USER_CTRL that mask names, I2C_MST_EN (0x20) say, on the chip as well."""
@@ -363,7 +371,7 @@ class MpuSetup:
             begun = time.ticks_ms()
             level = 0
             while level < self._packet and time.ticks_diff(time.ticks_ms(), begun) <= wait_ms:
-                self._set_up_read(_FIFO_COUNTH, self._two)
+                self.registers.read_registers(_FIFO_COUNTH, self._two)
                 level = self._two[0] << 8 | self._two[1]
             if level == self._packet:
                 return
@@ -414,15 +422,17 @@ class MpuSetup:
         """
         if self.read_register(_USER_CTRL) & _I2C_MST_EN:
             for control in _SLV_CTRL:
-                self._set_up_write(control, 0)
+                self.registers.write_register(control, 0)
             time.sleep_ms(5)  # 24 bytes and five addresses at the slowest clock
-        self._set_up_write(_USER_CTRL, self._INTERFACE)
+        self.registers.write_register(_USER_CTRL, self._INTERFACE)
 
     def _settle(self):
         # the gyro's start-up (PS 6.1) and four times the filter's delay, so that its step response
         # has died away
         time.sleep_ms(self._settle_ms)
-        self._set_up_read(_INT_STATUS, self._raw)  # what was ready meanwhile is not a fresh sample
+        self.registers.read_registers(
+            _INT_STATUS, self._raw
+        )  # what was ready meanwhile is not a fresh sample
 
     def _need_configured(self):
         if not self._configured:
@@ -431,8 +441,8 @@ class MpuSetup:
     def _apply(self):
         """Write the whole table, then read it back."""
         self._stop()
-        for register, value in self.registers():
-            self._set_up_write(register, value)
+        for register, value in self.configuration():
+            self.registers.write_register(register, value)
         for register in self._registers:
             self._verify(register)
 
@@ -447,28 +457,9 @@ class MpuSetup:
     def _set_row(self, register, value):
         """Change one row of the table, on the chip as well."""
         self._values[self._registers.find(bytes((register,)))] = value
-        self._set_up_write(register, value)
+        self.registers.write_register(register, value)
         self._verify(register)
 
     def _verify(self, register):
         row = self._registers.find(bytes((register,)))
-        value = self._values[row]
-        self._set_up_read(register, self._one)
-        if (self._one[0] ^ value) & self._masks[row]:
-            raise self.error_class(
-                f"{mpu_parts.name(register)}: wrote 0x{value:02x}, read 0x{self._one[0]:02x}"
-            )
-
-    def _set_up_read(self, register, buffer):
-        self._access(self._read_into, "reading", register, buffer)
-
-    def _set_up_write(self, register, value):
-        self._access(self._write, "writing", register, value)
-
-    def _access(self, function, verb, register, what):
-        try:
-            function(register, what)
-            return
-        except OSError as e:
-            fault = e
-        raise self.error_class(f"bus error ({fault}) while {verb} {mpu_parts.name(register)}")
+        self.registers.verify_register(register, self._values[row], self._masks[row])

@@ -22,6 +22,7 @@ _INNER = (
     *(
         "attitude",
         "fixmath",
+        "registers",
         "mpu_common",
         "mpu_parts",
         "mpu_setup",

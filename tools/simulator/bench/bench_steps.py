@@ -138,6 +138,8 @@ if not FILTERS_ONLY:
 def use(read, write):
     bus.readfrom_mem_into = read
     bus.writeto = write
+    if not FILTERS_ONLY:
+        imu.registers.bind(bus)
     display_bus.writeto = write
 
 
