@@ -203,7 +203,7 @@ def test_board_py_is_one_that_the_firmware_takes(board):
     from upright import settings as config
 
     settings = config.Config(board)
-    assert (settings.RATE, settings.DRIVE, settings.FILTER) == ((1000, 1), "timer", "mahony9")
+    assert (settings.RATE, settings.DRIVE, settings.FILTER) == ((1000, 1), "timer", None)
     assert not settings.DISPLAY_SHARES_BUS
     assert board.data_ready_pin() is not None
     assert board.sensor() is not None

@@ -14,7 +14,6 @@ PLATFORM = "pyboard"  # sys.platform there
 RATE = 1000
 SENSOR_RATE_HZ = 1000
 DRIVE = "timer"
-FILTER = "mahony9"
 DISPLAY_SHARES_BUS = False  # SPI1 is the OLED's alone: the main program writes it
 
 # The frame of the MPU6500, as its data sheet draws it on the package, is the body's.

@@ -74,7 +74,7 @@ class App:
         self._open_display()
         name = self.config.FILTER
         if name is None:
-            name = "inertial9" if hasattr(board, "magnetometer") else "inertial6"
+            name = filters.default(hasattr(board, "magnetometer"))
         filters.check(name)
         self._in_chip = name in filters.HARDWARE
         self.say("Upright", board.NAME, "looking for", "the sensor")

@@ -18,6 +18,11 @@ FILTERS = {
 HARDWARE = ("dmp6",)
 
 
+def default(magnetometer):
+    """The name of the filter where none is asked for."""
+    return "inertial9" if magnetometer else "inertial6"
+
+
 def check(name):
     """Raise ValueError for a name that no filter has."""
     if name not in FILTERS:
