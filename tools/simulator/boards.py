@@ -5,15 +5,18 @@ import machine
 from chips.mpu6050 import MPU6050Chip
 from chips.ssd1306 import SSD1306Chip
 
-# I2C boards: the bus of sensor and display, and the pin of INT
+# I2C boards: the bus of sensor and display, its pins SCL and SDA, and the pin of INT
 _I2C = {
-    "sim": (0, 6),
-    "pico": (0, 6),
-    "pico2": (0, 6),
-    "esp32": (0, 19),
-    "pyboard": (1, "X1"),
-    "weact_f411_blackpill": (1, "PB0"),
+    "sim": (0, 5, 4, 6),
+    "pico": (0, 5, 4, 6),
+    "pico2": (0, 5, 4, 6),
+    "esp32": (0, 22, 21, 19),
+    "pyboard": (1, "X9", "X10", "X1"),
+    "weact_f411_blackpill": (1, "PB6", "PB7", "PB0"),
 }
+
+
+_MAG_AXES = ("y", "-x", "-z")  # how the RoboMaster's magnetometer lies to the IMU
 
 
 class Parts:
@@ -28,15 +31,18 @@ class Parts:
 
 def _i2c_board(name, board, world, options):
     """MPU6050 and SSD1306 on one bus, or the display on the next."""
-    bus, interrupt = _I2C[name]
+    bus, scl, sda, interrupt = _I2C[name]
     imu = MPU6050Chip(world, who_am_i=options.get("who_am_i") or 0x68)
     display = SSD1306Chip()
     if options.get("imu", True):
-        machine.wire_i2c(bus, imu)
+        machine.wire_i2c(bus, imu, scl, sda)
         machine.wire_pin(interrupt, imu)
     if options.get("display", True):
         shared = getattr(board, "DISPLAY_SHARES_BUS", True)
-        machine.wire_i2c(bus if shared else bus + 1, display)
+        if shared:
+            machine.wire_i2c(bus, display, scl, sda)
+        else:
+            machine.wire_i2c(bus + 1, display)
     return Parts(imu, None, display, [machine.I2C(bus)._bus, machine.I2C(bus + 1)._bus])
 
 
@@ -46,7 +52,7 @@ def _robomaster_a(name, board, world, options):
     from chips.mpu6500 import MPU6500Chip
 
     imu = MPU6500Chip(world, who_am_i=options.get("who_am_i") or 0x70)
-    mag = IST8310Chip(world, axes=board.MAG_AXES)
+    mag = IST8310Chip(world, axes=getattr(board, "MAG_AXES", _MAG_AXES))
     display = SSD1306Chip()
     if options.get("mag", True):
         imu.aux.append(mag)
@@ -66,7 +72,7 @@ BOARDS.update({name: _i2c_board for name in _I2C})
 def wire(name, board, world, options):
     """Wire the simulated parts of boards/<name> -> Parts.
 
-    board: its board.py, already imported. options: who_am_i (None: the part that belongs there), and imu, mag,
+    board: its board.py, already imported, or None. options: who_am_i (None: the part that belongs there), and imu, mag,
     display: False where the part is missing.
     """
     if name not in BOARDS:

@@ -2,7 +2,12 @@
 # It behaves as the rp2 port does, with bus time for every byte. Two transfers that meet on one bus spoil each other
 # (counted in `cuts`), as they do on a board. Simulated chips are attached with the wire_... functions at the end.
 
+import sys
+
 import kernel
+import simulated_time
+
+sys.modules["utime"] = simulated_time  # a file of that name would not override the unix port's
 
 EIO = 5
 ETIMEDOUT = 110

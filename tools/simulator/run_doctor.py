@@ -6,7 +6,7 @@ import sys
 
 import kernel
 import machine
-from world import StillWorld
+from world import LEVEL, StillWorld
 
 import boards
 
@@ -15,8 +15,7 @@ def main():
     with open(sys.argv[1]) as file:
         config = json.load(file)
     machine.power_on()
-    # level, a field of 49 uT that dips by 60 degrees into the ground, heading north
-    world = StillWorld((0, 0, 4096, 0, 0, 0, 82, 0, -141))
+    world = StillWorld(LEVEL)
     world.start(0)
     kernel.advance(200000)  # so long do the chips take after power-up
 

@@ -185,6 +185,37 @@ class StillWorld(_Clock):
         pass
 
 
+# level and at rest at +-8 g, heading north in a field of 49 uT that dips by 60 degrees into the ground; 25 degC
+LEVEL = (0, 0, 4096, 0, 0, 0, 82, 0, -141, -3920)
+# Parts of the sum of four random bytes (its standard deviation is 148) that are a sensor's noise: 4 mg and 0.05 deg/s
+# rms (PS-MPU-6000A 6.1, 6.2, at about 100 Hz), and one count of the magnetometer
+_NOISE = (9, 9, 9, 180, 180, 180, 140, 140, 140)
+
+
+class NoisyWorld(StillWorld):
+    """A board at rest and level whose samples have a sensor's noise; the same noise each time."""
+
+    def __init__(self):
+        StillWorld.__init__(self, LEVEL, rate=(1000, 1), n=1 << 30)
+        self._at = -1
+
+    def row(self, k):
+        if k != self._at:
+            self._at = k
+            x = (k + 1) * 0x9E3779B1 & 0xFFFFFFFF
+            for i in range(9):
+                x ^= x << 13 & 0xFFFFFFFF  # Marsaglia's xorshift
+                x ^= x >> 17
+                x ^= x << 5 & 0xFFFFFFFF
+                noise = (x & 255) + (x >> 8 & 255) + (x >> 16 & 255) + (x >> 24) - 510
+                self._row[i] = LEVEL[i] + (noise + _NOISE[i] // 2) // _NOISE[i]
+        return self._row
+
+    def load(self, k, out):
+        self.row(k)
+        StillWorld.load(self, k, out)
+
+
 def header_line(name, rate, rows, accel_lsb_per_g, gyro_scale, clocked, truth_every=0):
     """The first line of an `.imu` file as bytes, newline included. ValueError when too long."""
     fields = {
