@@ -7,7 +7,7 @@ import pytest
 from conftest import require
 from upright.fixmath import euler
 from upright.mahony import Mahony6, Mahony9
-from upright_host import bench, tracing
+from upright_host import bench, console, tracing
 
 
 def log(*lines):
@@ -170,8 +170,8 @@ def test_the_command_fails_below_the_ratio_asked_for(monkeypatch, ratio, code):
     import typer
     from typer.testing import CliRunner
 
-    monkeypatch.setattr(bench, "measure", lambda progress: figures(ratio))
-    app = typer.Typer()
+    monkeypatch.setattr(bench, "measure", lambda: figures(ratio))
+    app = typer.Typer(cls=console.Commands)
     bench.register(app)
     done = CliRunner().invoke(app, [])
     assert done.exit_code == code, done.output

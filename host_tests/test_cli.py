@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from typer.testing import CliRunner
-from upright_host import cli, replay, scoring, simulate
+from upright_host import cli, replay, runtimes, scoring, simulate
 
 
 @pytest.fixture
@@ -77,50 +77,25 @@ def test_demo_plays_a_trial_through_the_chip(upright, trial):
     assert re.search(r"inclination \d\.\d+ deg", done.output)
 
 
-@pytest.mark.parametrize("command", [("demo", "--headless", "--trial"), ("replay",)])
-def test_what_is_no_trial_is_named_with_what_is_wrong(upright, tmp_path, trial, command):
-    absent = upright(*command, tmp_path / "absent.npz")
-    assert absent.exit_code == 2
-    assert "absent.npz" in absent.output.replace("\n", "")
-    cut = tmp_path / "cut.npz"
-    cut.write_bytes(trial.read_bytes()[:2000])
-    done = upright(*command, cut)
+def test_demo_refuses_a_negative_speed(upright):
+    done = upright("demo", "--headless", "--speed", "-2")
     assert done.exit_code == 2
-    assert "cut.npz" in done.output.replace("\n", "")
-    assert "Traceback" not in done.output
-    text = tmp_path / "text.npz"
-    text.write_text("not a trial")
-    assert upright(*command, text).exit_code == 2
-
-
-@pytest.mark.parametrize(
-    "arguments, said",
-    [
-        (("--motion", "waltz"), "unknown motion"),
-        (("--seconds", "-1"), "positive"),
-        (("--runtime", "z80"), "unknown runtime"),
-        (("--speed", "-2"), "speed"),
-    ],
-)
-def test_demo_refuses_what_it_cannot_do(upright, arguments, said):
-    done = upright("demo", "--headless", *arguments)
-    assert done.exit_code in (2, 3)
-    assert said in done.output
-    assert "Traceback" not in done.output
+    assert "speed" in done.output
 
 
 def test_replay_writes_the_same_bytes_on_every_runtime_and_scores(
     upright, runtime, trial, tmp_path
 ):
     out, ours = tmp_path / "out.csv", tmp_path / "ours.csv"
-    done = upright("replay", trial, "--runtime", runtime, "--out", out, "--seconds", 3)
+    mahony = ("replay", trial, "--filter", "mahony6", "--seconds", 3)
+    done = upright(*mahony, "--runtime", runtime, "--out", out)
     assert done.exit_code == 0, done.output
     t, _ = scoring.read_csv(out)
     assert len(t) == 600
     assert t[-1] == pytest.approx(599 / 200)
     assert "inclination" in done.output
     assert "best heading" in done.output
-    upright("replay", trial, "--runtime", "cpython", "--out", ours, "--seconds", 3, "--direct")
+    upright(*mahony, "--runtime", "cpython", "--out", ours, "--direct")
     assert out.read_bytes() == ours.read_bytes()
 
 
@@ -134,25 +109,141 @@ def test_replay_takes_the_gains(upright, trial, tmp_path):
     files = []
     for kp in (0.5, 2):
         files.append(tmp_path / f"{kp}.csv")
-        assert upright("replay", trial, "--direct", "--kp", kp, "--out", files[-1]).exit_code == 0
+        mahony = ("replay", trial, "--filter", "mahony6", "--direct")
+        assert upright(*mahony, "--kp", kp, "--out", files[-1]).exit_code == 0
     assert files[0].read_bytes() != files[1].read_bytes()
 
 
 @pytest.mark.parametrize(
     "name, said",
-    [("nope", "unknown filter 'nope'; there are dmp6, euler6"), ("dmp6", "computed in the sensor")],
+    [("nope", "unknown filter 'nope'; there are mahony6"), ("dmp6", "computed in the sensor")],
 )
 def test_replay_refuses_a_filter_that_it_cannot_feed_in_one_line(upright, trial, name, said):
     done = upright("replay", trial, "--filter", name)
-    assert done.exit_code == 1
+    assert done.exit_code == 2
     assert said in " ".join(done.output.split())
     assert "Traceback" not in done.output and "File" not in done.output
 
 
 def test_replay_refuses_what_the_filter_refuses(upright, trial):
-    done = upright("replay", trial, "--direct", "--kp", 1e6)
-    assert done.exit_code == 1
-    assert "kp" in done.output
+    done = upright("replay", trial, "--direct", "--filter", "mahony6", "--kp", 1e6)
+    assert done.exit_code == 2
+    assert "kp is 1000000.0, expected" in done.output
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("inertial6", "inertial6 with {'kp': 1.0}: no parameter 'kp'; there are"),
+        ("euler6", "euler6 has no kp; its gains are tau"),
+        ("kalman6", "kalman6 has no kp"),
+    ],
+)
+def test_a_gain_that_a_filter_lacks_is_named(upright, trial, name, said):
+    done = upright("replay", trial, "--filter", name, "--kp", 1)
+    assert done.exit_code == 2
+    assert said in done.output and len(done.output.splitlines()) == 1
+
+
+def test_the_default_filter_is_the_firmwares_everywhere(upright, trial, tmp_path):
+    assert ", inertial9, " in upright("replay", trial, "--direct").output
+    with np.load(trial) as whole:
+        np.savez(tmp_path / "six.npz", **{k: v for k, v in whole.items() if k != "mag"})
+    assert ", inertial6, " in upright("replay", tmp_path / "six.npz", "--direct").output
+    for board, name in (("sim", "inertial6"), ("robomaster_a", "inertial9")):
+        done = upright("demo", "--headless", "--seconds", 2, "--board", board)
+        assert f"{name}, error against the truth" in done.output
+
+
+@pytest.fixture(scope="module")
+def recorded_csv(tmp_path_factory):
+    path = tmp_path_factory.mktemp("csv") / "rest.csv"
+    path.write_text("ax,ay,az\n" + "0,0,4096\n" * 10)
+    return path
+
+
+# What a person may get wrong, with what is said; TRIAL, CSV, CUT, DIR and NONE stand for files and folders
+WRONG = {
+    "demo --filters mahony6,foo": "unknown filter 'foo'",
+    "demo --filters ,": "no filter is named",
+    "demo --motion waltz": "unknown motion 'waltz'",
+    "demo --seconds -1": "-1.0 is not a positive number of seconds",
+    "demo --runtime z80": "unknown runtime 'z80'",
+    "demo --board abacus": "unknown board 'abacus'; there are esp32",
+    "demo --png NONE/a.png": "there is no folder",
+    "demo --trial CUT": "CUT",
+    "replay NONE": "no such file",
+    "replay CUT": "CUT",
+    "replay DIR": "is a folder",
+    "replay TEXT": "TEXT is not an .npz archive",
+    "replay TRIAL --runtime z80": "unknown runtime 'z80'",
+    "replay TRIAL --seconds 0": "0.0 is not a positive number of seconds",
+    "replay TRIAL --out NONE/a.csv": "there is no folder",
+    "replay TRIAL --out DIR": "cannot be written",
+    "replay TRIAL --direct --out /dev/full": "/dev/full cannot be written: No space left on device",
+    "score TRIAL --filters mahony6,foo": "unknown filter 'foo'",
+    "score CUT": "no trial to score",
+    "score TRIAL --csv NONE/a.csv": "there is no folder",
+    "score TRIAL --seconds -3": "-3.0 is not a positive number of seconds",
+    "compare TRIAL --filters mahony6,foo": "unknown filter 'foo'",
+    "compare CUT": "no trial to compare on",
+    "compare TRIAL --runtime z80": "unknown runtime 'z80'",
+    "tune kalman CUT": "CUT",
+    "tune kalman TRIAL --source foo": "unknown source 'foo'",
+    "tune kalman TRIAL --runtime z80": "unknown runtime 'z80'",
+    "calibrate mag NONE": "no such file",
+    "calibrate mag CUT": "CUT",
+    "calibrate mag CSV": "no magnetometer sample",
+    "calibrate gyro CSV": "give --rate",
+    "calibrate gyro CSV --rate 200 --out NONE/a.json": "there is no folder",
+    "calibrate show NONE": "missing",
+    "doctor --simulated foo": "unknown board 'foo'; there are esp32",
+    "exec --runtime z80 CSV": "unknown runtime 'z80'",
+    "exec --board abacus CSV": "unknown board 'abacus'",
+    "dmp check NONE": "No such file",
+    "runtimes --image NONE": "No such file",
+    "bench --save NONE/a.md": "there is no folder",
+}
+
+
+@pytest.mark.parametrize("line", WRONG)
+def test_what_is_wrong_is_one_line_without_a_traceback_and_exit_code_2(
+    upright, trial, recorded_csv, tmp_path, line
+):
+    cut = tmp_path / "cut.npz"
+    cut.write_bytes(trial.read_bytes()[:2000])
+    stand_for = {
+        **{"TRIAL": trial, "CUT": cut, "CSV": recorded_csv, "TEXT": recorded_csv},
+        **{"DIR": tmp_path, "NONE": tmp_path / "none"},
+    }
+    words = line.split()
+    for word, file in stand_for.items():
+        words = [each.replace(word, str(file)) for each in words]
+    done = upright(*words)
+    assert isinstance(done.exception, SystemExit), done.exception
+    assert done.exit_code == 2, done.output
+    assert WRONG[line].replace("CUT", str(cut)).replace("TEXT", str(recorded_csv)) in done.stderr
+    assert "Traceback" not in done.output
+
+
+def test_what_is_not_here_is_exit_code_3(upright, trial, monkeypatch):
+    def not_here(name):
+        why = runtimes.Unavailable("no mirror")
+        why.runtime = name
+        raise why
+
+    monkeypatch.setattr(runtimes, "interpreter", not_here)
+    for words in (
+        ("demo", "--headless", "--runtime", "unix"),
+        ("replay", trial, "--runtime", "unix32"),
+        ("score", trial, "--runtime", "arm"),
+        ("compare", trial, "--no-costs", "--runtime", "arm"),
+        ("exec", "--runtime", "unix", trial),
+        ("tune", "kalman", trial, "--source", "mahony6", "--runtime", "unix"),
+    ):
+        done = upright(*words)
+        assert (done.exit_code, done.stdout) == (3, "")
+        assert re.fullmatch(r"runtime \w+ cannot be had here: no mirror\n", done.stderr)
 
 
 def test_a_simulation_that_dies_is_told_with_its_last_words(tmp_path):

@@ -9,9 +9,9 @@ import typer
 from dmp_images import LIST, V20, V612
 from typer.testing import CliRunner
 from upright import dmp_image as mpu_dmp_image
-from upright_host import dmp
+from upright_host import console, dmp, paths
 
-APP = typer.Typer()
+APP = typer.Typer(cls=console.Commands)
 dmp.register(APP)
 
 
@@ -25,7 +25,7 @@ def run(*args):
 def refused(*args):
     """The one line that it says."""
     code, output = run(*args)
-    assert code == 1 and len(output.strip().splitlines()) == 1
+    assert code == 2 and len(output.strip().splitlines()) == 1
     return output.strip()
 
 
@@ -201,6 +201,6 @@ def test_no_image_is_taken_for_text():
 def test_the_image_module_needs_neither_the_shim_nor_numpy():
     code = "import sys; sys.path.insert(0, sys.argv[1]); from upright import dmp_image; print(len(dmp_image.KNOWN))"
     done = subprocess.run(
-        [sys.executable, "-S", "-c", code, str(dmp.paths.LIB)], capture_output=True, text=True
+        [sys.executable, "-S", "-c", code, str(paths.LIB)], capture_output=True, text=True
     )
     assert done.returncode == 0 and int(done.stdout) == len(dmp.KNOWN)

@@ -97,8 +97,8 @@ def test_other_gains_give_other_bits(rendered, tmp_path):
 def test_recorded_trials_replay_the_same_through_the_chip_and_past_it(recorded):
     trial = trials.load(recorded)
     runtime = simulate.best_runtime()
-    through = replay.replay(trial, runtime=runtime, seconds=20)
-    straight = replay.replay(trial, runtime=runtime, seconds=20, direct=True)
+    through = replay.replay(trial, "mahony6", runtime=runtime, seconds=20)
+    straight = replay.replay(trial, "mahony6", runtime=runtime, seconds=20, direct=True)
     assert (through.q29 == straight.q29).all()
 
 
@@ -107,7 +107,7 @@ def test_recorded_trials_are_followed_as_well_as_this_filter_can(recorded):
     trial = trials.load(recorded)
     if not trial.has_truth:
         pytest.skip(f"{trial.name} has no truth")
-    done = replay.replay(trial, runtime=simulate.best_runtime(), direct=True)
+    done = replay.replay(trial, "mahony6", runtime=simulate.best_runtime(), direct=True)
     assert done.score.coverage > 0.99
     # From raw gyro: the phone and the static MPU6050 have biases of several deg/s, which tilt this filter by bias / kp.
     assert done.score.inclination < (6 if trial.name.startswith("broad") else 20)

@@ -19,7 +19,7 @@ from chips.mpu6500 import MPU6500Chip
 from chips.ssd1306 import SSD1306Chip
 from rich.console import Console
 from upright_host import bench as bench_command
-from upright_host import emulated, replay, runtimes, scoring, tracing, trials
+from upright_host import console, emulated, replay, runtimes, scoring, tracing, trials
 from upright_host import rp2040 as firmware
 from world import StillWorld, World
 
@@ -318,12 +318,12 @@ def test_a_replay_on_the_board_writes_the_bytes_that_cpython_writes(image, tmp_p
     # nobody says how much of it: as much as is short, and that is told
     monkeypatch.setattr(replay, "BOARD_SECONDS", 1.05)
     told = io.StringIO()
-    monkeypatch.setattr(runtimes, "console", Console(file=told, width=200))
+    monkeypatch.setattr(console, "errors", Console(file=told, width=200))
     progress = []
     there = replay.replay(
-        trial, runtime="rp2040", gains=gains, on_progress=lambda *at: progress.append(at)
+        trial, "mahony6", "rp2040", gains=gains, on_progress=lambda *at: progress.append(at)
     )
-    here = replay.replay(trial, seconds=1.05, gains=gains)
+    here = replay.replay(trial, "mahony6", seconds=1.05, gains=gains)
     assert "the first 1.05 of" in told.getvalue()
     for name, q29 in (("there", there.q29), ("here", here.q29)):
         scoring.write_csv(tmp_path / name, q29, trial.rate)

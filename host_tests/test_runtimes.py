@@ -6,7 +6,7 @@ import sys
 
 import pytest
 from typer.testing import CliRunner
-from upright_host import cli, debian, paths, runtimes
+from upright_host import cli, console, debian, paths, runtimes
 
 
 @pytest.fixture
@@ -39,7 +39,7 @@ def test_each_micropython_is_what_it_is_named_for(micropython_runtime, tmp_path)
 
 
 def test_an_unknown_runtime_is_refused_by_name():
-    with pytest.raises(runtimes.Unavailable, match="unknown runtime 'z80'; there are cpython"):
+    with pytest.raises(console.Wrong, match="unknown runtime 'z80'; there are cpython"):
         runtimes.interpreter("z80")
 
 
@@ -102,8 +102,8 @@ def test_exec_says_why_a_runtime_cannot_be_had(tmp_path):
     script = tmp_path / "script.py"
     script.write_text("")
     done = CliRunner().invoke(cli.app, ["exec", "--runtime", "z80", str(script)])
-    assert done.exit_code == 3
-    assert "unknown runtime" in done.stdout
+    assert done.exit_code == 2
+    assert "unknown runtime" in done.stderr
 
 
 def test_the_cache_is_where_it_is_told_to_be(monkeypatch, tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import typer
 from typer.testing import CliRunner
-from upright_host import baselines, score, scoring, trials
+from upright_host import baselines, console, score, scoring, trials
 
 RATE, SECONDS, EVERY = 100, 3, 4
 TURN = math.radians(-40)  # the sensor's heading: x is 40 deg east of north
@@ -61,7 +61,7 @@ def save(path, off_deg=0.0, gyro=(0, 0, 0), rate=RATE, seconds=SECONDS, **header
 @pytest.fixture
 def run(tmp_path):
     """run(*arguments) -> what `upright score ARGUMENTS --runtime cpython` said, with exit_code."""
-    app = typer.Typer()
+    app = typer.Typer(cls=console.Commands)
     app.callback()(lambda: None)
     score.register(app)
 
@@ -162,7 +162,7 @@ def test_single_files_and_the_first_seconds(run, folder, tmp_path):
     first = rows_of(out)[0]
     assert first["samples"] == "25" and first["coverage"] == "0.5000"
     done = run(file, "--filters", "mahony6", "--seconds", 0.5)
-    assert done.exit_code == 1
+    assert done.exit_code == 2
     assert "north.npz: its truth begins after 1.0 s" in done.output
 
 
@@ -189,20 +189,20 @@ def test_through_the_chips_it_is_the_same_motion(run, folder, tmp_path):
     "arguments, message",
     [
         (("--filters", "mahony7"), "unknown filter 'mahony7'; there are mahony6, mahony9"),
-        (("--filters", ","), "no filter to score"),
+        (("--filters", ","), "no filter is named"),
         (("nothing",), "nothing: no such file"),
     ],
 )
 def test_a_wrong_command_says_what_is_wrong(run, folder, arguments, message):
     where = [folder] if arguments[0].startswith("-") else []
     done = run(*where, *arguments)
-    assert done.exit_code == 1
+    assert done.exit_code == 2
     assert message in done.output
 
 
 def test_a_folder_without_trials_says_so(run, tmp_path):
     done = run(tmp_path)
-    assert done.exit_code == 1
+    assert done.exit_code == 2
     assert f"no trials (.npz) in {tmp_path}" in done.output.replace("\n", "")
 
 
@@ -280,7 +280,7 @@ def test_without_matplotlib_there_are_tables_and_one_clear_line(run, folder, tmp
     done = run(
         folder / "north.npz", "--filters", "mahony6", "--csv", out, "--png", picture, "--seconds", 2
     )
-    assert done.exit_code == 1
+    assert done.exit_code == 3
     assert "matplotlib is not installed: .venv/bin/pip install" in done.output
     assert rows_of(out) and not picture.exists()
 
@@ -300,5 +300,7 @@ def test_the_picture_has_a_bar_for_each_trial_and_filter_and_means(folder, tmp_p
     with Image.open(tmp_path / "out.png") as picture:
         assert picture.width > 600 and picture.height > 500
         assert len(picture.convert("RGB").getcolors(1 << 20)) > 5
-    with pytest.raises(score.ScoreError, match="no picture"):
+    with pytest.raises(console.Wrong, match=r"out\.png cannot be written"):
         score.save_png(score.Report(rows), tmp_path / "none" / "out.png")
+    with pytest.raises(console.Wrong, match=r"no picture: .*out\.txt.*not supported"):
+        score.save_png(score.Report(rows), tmp_path / "out.txt")

@@ -9,7 +9,7 @@ import pytest
 import typer
 from test_compare import figures, line_of, save  # noqa: F401 (figures: a fixture)
 from typer.testing import CliRunner
-from upright_host import kalman_scan, plotting, trials, tune
+from upright_host import console, kalman_scan, plotting, trials, tune
 
 HZ = 100.0
 
@@ -33,7 +33,7 @@ def walk(ratio, n=12000, noise=2.0, seed=1):
 
 @pytest.fixture
 def run():
-    app = typer.Typer()
+    app = typer.Typer(cls=console.Commands)
     app.callback()(lambda: None)
     tune.register(app)
 
@@ -186,22 +186,22 @@ def test_the_scan_becomes_a_table_sentences_a_file_and_a_picture(run, tmp_path):
 )
 def test_a_wrong_command_says_what_is_wrong(run, tmp_path, arguments, message):
     done = run(save(tmp_path / "hand.npz", seconds=1.5), *arguments)
-    assert done.exit_code == 1
+    assert done.exit_code == 2
     assert message in done.output
 
 
 def test_without_a_truth_or_a_trial_there_is_one_clear_line(run, tmp_path):
     done = run(save(tmp_path / "t.npz", seconds=1.5, without=("q_gt", "movement")))
-    assert done.exit_code == 1 and "t.npz: no truth in it" in done.output
+    assert done.exit_code == 2 and "t.npz: no truth in it" in done.output
     done = run(tmp_path / "none.npz")
-    assert done.exit_code == 1 and "none.npz: no such file" in done.output
+    assert done.exit_code == 2 and "none.npz: no such file" in done.output
 
 
 def test_without_matplotlib_there_is_a_table_and_one_clear_line(run, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     monkeypatch.setattr(tune, "grid", lambda: [(10.0, 0.05), (1.0, 0.05)])
     done = run(save(tmp_path / "hand.npz", seconds=1.5), "--png", tmp_path / "out.png")
-    assert done.exit_code == 1
+    assert done.exit_code == 3
     assert "matplotlib is not installed: .venv/bin/pip install" in done.output
     assert "best" in done.output
 

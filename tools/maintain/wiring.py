@@ -1,8 +1,9 @@
-"""Draws the wiring pictures of the I2C boards, boards/<name>/wiring.svg: which pin goes to which of the modules."""
+"""Draws the wiring pictures of the I2C boards, boards/<name>/wiring.svg: which pin goes to which of the modules.
+
+.venv/bin/python tools/maintain/wiring.py
+"""
 
 from pathlib import Path
-
-import typer
 
 from upright_host import paths
 
@@ -104,12 +105,7 @@ def path_of(folder: str) -> Path:
     return paths.BOARDS / folder / "wiring.svg"
 
 
-def register(app: typer.Typer):
-    """Add `upright wiring` to the command line."""
-
-    @app.command("wiring")
-    def wiring_command():
-        """Draw the wiring pictures of boards/ anew."""
-        for folder in BOARDS:
-            path_of(folder).write_text(draw(folder))
-            print(path_of(folder).relative_to(paths.ROOT))
+if __name__ == "__main__":
+    for folder in BOARDS:
+        path_of(folder).write_text(draw(folder))
+        print(path_of(folder).relative_to(paths.ROOT))

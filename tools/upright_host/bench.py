@@ -15,11 +15,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from upright_host import emulated, paths, rp2040, runtimes, tracing
+from upright_host import console, emulated, options, paths, rp2040, runtimes, tracing
+from upright_host.console import Failed, Wrong
 
 PROGRAMS = paths.SIMULATOR / "bench"
 STEPS = "bench_steps"
@@ -186,8 +185,8 @@ def allocated(runtime: str, n: int = TRACE_STEPS) -> dict[str, float]:
 
 
 # ---------------------------------------------------------------------------------------- all of it
-def measure(progress: Progress | None = None) -> Figures:
-    """Everything that this machine can measure."""
+def measure(progress=console.progress) -> Figures:
+    """Everything that this machine can measure. progress: console.progress, or the like."""
     figures = Figures()
     marks = 4 * len({*PARTS, *_AROUND})  # qemu's: a part's begin and end, without and with steps
 
@@ -214,17 +213,11 @@ def measure(progress: Progress | None = None) -> Figures:
         ("cycles", "rp2040", board),
     )
     for what, runtime, job in jobs:
-        task = progress.add_task(f"{what} on {runtime}", total=marks) if progress else None
-
-        def at(done, task=task):
-            if progress:
-                progress.update(task, completed=done)
-
-        try:
-            job(runtime, at)
-        except (runtimes.Unavailable, tracing.TraceError, subprocess.TimeoutExpired) as why:
-            figures.not_here.append(f"{what} on {runtime}: not measured: {why}")
-        at(marks)
+        with progress(f"{what} on {runtime}", marks) as at:
+            try:
+                job(runtime, at)
+            except (runtimes.Unavailable, Failed, subprocess.TimeoutExpired) as why:
+                figures.not_here.append(f"{what} on {runtime}: not measured: {why}")
     return figures
 
 
@@ -276,10 +269,10 @@ def remarks(figures: Figures) -> Iterator[str]:
 
 
 def save(figures: Figures, file: Path) -> None:
-    """Replace the figures in a Markdown file, between its two marks. Raises ValueError where they are missing."""
+    """Replace the figures in a Markdown file, between its two marks. Raises Wrong where they are missing."""
     text = file.read_text()
     if not re.search(f"{_BEGIN}.*{_END}", text, re.DOTALL):
-        raise ValueError(f"{file} has no place for the figures: {_BEGIN} ... {_END}")
+        raise Wrong(f"{file} has no place for the figures: {_BEGIN} ... {_END}")
     new = [_BEGIN, "", *_markdown(rows(figures)), "", *(f"- {r}" for r in remarks(figures)), ""]
     if figures.cycles:
         title = BOARD_TITLE[0].upper() + BOARD_TITLE[1:]
@@ -295,14 +288,14 @@ def _markdown(lines: Iterable[tuple[str, ...]]) -> list[str]:
     return table + ["| " + " | ".join(row) + " |" for row in body]
 
 
-def _show(console: Console, title: str, lines: Iterable[tuple[str, ...]]) -> None:
+def _show(title: str, lines: Iterable[tuple[str, ...]]) -> None:
     head, *body = lines
     table = Table(title=title, title_justify="left", box=None, pad_edge=False)
     for k, text in enumerate(head):
         table.add_column(text, justify="right" if k else "left")
     for row in body:
         table.add_row(*row)
-    console.print(table)
+    console.out.print(table)
 
 
 def register(app: typer.Typer) -> None:
@@ -311,25 +304,21 @@ def register(app: typer.Typer) -> None:
     @app.command("bench")
     def bench_command(
         save_to: Path = typer.Option(
-            None, "--save", help=f"Put the figures into this Markdown file ({DOCS.name} of docs/)."
+            None,
+            "--save",
+            callback=options.writable,
+            help=f"Put the figures into this Markdown file ({DOCS.name} of docs/).",
         ),
     ):
         """Measure what a tick costs: instructions on arm, microseconds on unix, bytes; as ratios to a float filter."""
-        console = Console()
-        columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-        with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-            figures = measure(progress)
-        _show(console, "one step, without loop and bus", rows(figures))
+        figures = measure()
+        _show("one step, without loop and bus", rows(figures))
         if figures.cycles:
-            _show(console, BOARD_TITLE, board_rows(figures))
+            _show(BOARD_TITLE, board_rows(figures))
         for remark in remarks(figures):
-            console.print(remark, highlight=False, soft_wrap=True)
+            console.say(remark)
         if save_to:
-            try:
-                save(figures, save_to)
-            except (OSError, ValueError) as why:
-                console.print(str(why), style="red", highlight=False, markup=False)
-                raise typer.Exit(2) from None
+            save(figures, save_to)
         of = figures.instructions
         if of and of[_FLOAT] < LEAST_RATIO * of["filter"]:
-            raise typer.Exit(1)
+            raise typer.Exit(console.FAILED)

@@ -3,7 +3,6 @@
 The replays and their figures are score.py's, the costs filter_costs.py's, the scalar Kalman filter's picture tune.py's.
 """
 
-import csv
 import os
 import re
 from collections.abc import Iterator
@@ -12,13 +11,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from upright_host import (
     baselines,
+    console,
     filter_costs,
+    options,
     plotting,
     registry,
     replay,
@@ -29,6 +28,7 @@ from upright_host import (
     trials,
     tune,
 )
+from upright_host.console import Failed, Wrong
 
 COLUMNS = (
     *("trial", "filter", "heading_measure", "inclination", "heading", "total"),
@@ -61,11 +61,11 @@ class Comparison:
 
 
 def choose(filters: str | None, with_baselines: bool, notes: list) -> list[str]:
-    """The names to compare, all of the registry unless some are asked for. Raises score.ScoreError."""
+    """The names to compare, all of the registry unless some are asked for. Raises Wrong."""
     names = (
-        registry.filters()
+        list(registry.filters())
         if filters is None
-        else [name.strip() for name in filters.split(",") if name.strip()]
+        else registry.listed(filters, baselines.BASELINES)
     )
     hardware = registry.hardware()
     left_out = [name for name in names if name in hardware]
@@ -186,55 +186,39 @@ def table(comparison: Comparison) -> Table:
     return made
 
 
-def show(comparison: Comparison, console: Console) -> None:
-    console.print(f"\n{comparison.trial.name}", style="bold", highlight=False, markup=False)
+def show(comparison: Comparison) -> None:
+    console.say(f"\n{comparison.trial.name}", "bold")
     if comparison.lines:
-        console.print(table(comparison))
+        console.out.print(table(comparison))
     if not comparison.trial.has_truth:
-        say_notes(["no truth in this trial: no errors to tell"], console)
+        score.say_notes(["no truth in this trial: no errors to tell"])
     elif comparison.lines and not any(line.row.score.samples for line in comparison.lines):
-        say_notes(["no truth in this span: no errors to tell"], console)
-    say_notes(comparison.notes, console)
-
-
-def say_notes(notes, console) -> None:
-    for note in notes:
-        console.print(note, style="yellow", highlight=False, markup=False, soft_wrap=True)
+        score.say_notes(["no truth in this span: no errors to tell"])
+    score.say_notes(comparison.notes)
 
 
 def rows(comparison: Comparison) -> Iterator[list]:
     """For a CSV file: the values of COLUMNS."""
     for line in comparison.lines:
         s = line.row.score
-        values = [line.row.trial, line.row.filter, line.row.measure, *line.figures()]
         yield [
-            "" if value is None else f"{value:.4f}" if isinstance(value, float) else value
-            for value in [*values, s.samples, s.coverage]
+            *(line.row.trial, line.row.filter, line.row.measure),
+            *(*line.figures(), s.samples, s.coverage),
         ]
-
-
-def write_csv(lines: list[list], path: Path) -> None:
-    with open(path, "w", newline="", encoding="utf-8") as file:
-        csv.writer(file, lineterminator="\n").writerows([COLUMNS, *lines])
 
 
 def picture_files(where: Path, names: list[str]) -> list[Path]:
     """A file for each trial: `where` itself for one, if it ends in .png, else NAME.png in the folder `where`."""
     if where.suffix.lower() == ".png":
         if len(names) > 1:
-            raise score.ScoreError(
-                f"{where} is one file, and there are {len(names)} trials: name a folder"
-            )
+            raise Wrong(f"{where} is one file, and there are {len(names)} trials: name a folder")
         return [where]
     return [where / f"{re.sub('[^A-Za-z0-9_.-]+', '_', name).strip('_')}.png" for name in names]
 
 
 def draw(comparison: Comparison, file: Path, seconds: float | None = None) -> list[Path]:
-    """The attitudes in `file`, the scalar Kalman filter in ..._kalman.png beside it. Raises plotting.PictureError."""
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as why:
-        raise plotting.PictureError(f"no picture: {why}") from why
+    """The attitudes in `file`, the scalar Kalman filter in ..._kalman.png beside it. Raises what plotting does."""
+    file.parent.mkdir(parents=True, exist_ok=True)
     beside = file.with_name(f"{file.stem}_kalman{file.suffix}")
     plotting.attitudes(comparison.trial, [line.row for line in comparison.lines], file)
     tune.draw_waveform(comparison.trial, beside, seconds)
@@ -251,17 +235,13 @@ def register(app: typer.Typer) -> None:
         filters: str = typer.Option(
             None, help="Filters, with commas between (default: all); baselines may be among them."
         ),
-        runtime: str = typer.Option(
-            None, help="cpython, unix, unix32, arm or rp2040 (default: unix where it can be had)."
-        ),
-        baselines: bool = typer.Option(
-            False, "--baselines", help="All of other people's filters beside: vqf, ahrs, imufusion."
-        ),
-        csv: Path = typer.Option(None, help="Write the figures to this file."),
+        runtime: str = options.runtime(board=True),
+        baselines: bool = score.BASELINES_OPTION,
+        csv: Path = options.output("Write the figures to this file."),
         png: Path = typer.Option(
             None, help="Draw two pictures a trial: into this folder, or for one trial NAME.png."
         ),
-        seconds: float = typer.Option(None, help="Only the first so many seconds of each trial."),
+        seconds: float = options.seconds("Only the first so many seconds of each trial."),
         through_chips: bool = typer.Option(
             False,
             "--through-chips",
@@ -270,71 +250,44 @@ def register(app: typer.Typer) -> None:
         costs: bool = typer.Option(
             True, help="Count instructions and bytes; kept until a source changes."
         ),
-        jobs: int = typer.Option(None, min=1, help="Replays at a time (default: one a processor)."),
+        jobs: int = options.jobs("Replays"),
     ):
         """Compare all filters on recorded trials: errors, settling time, cost; truth, attitudes and errors drawn."""
-        if seconds is not None and not seconds > 0:
-            raise typer.BadParameter(f"{seconds} is not a positive number of seconds")
-        console, runtime = Console(), runtime or simulate.best_runtime()
+        runtime = runtime or simulate.best_runtime()
         if runtime == "rp2040":
             seconds = seconds or replay.BOARD_SECONDS
         notes, no_picture = [], None
-        try:
-            names = choose(filters, baselines, notes)
-            runtimes.interpreter(runtime)
-            usable = score.load(score.find(where), seconds, notes, truthless=True)
-            if not usable:
-                raise score.ScoreError("\n".join([*notes, "no trial to compare on"]))
-            files = picture_files(png, [trial.name for _, trial in usable]) if png else []
-            with _progress() as progress:
-                task = progress.add_task("costs of an update", total=len(names))
-                found = (
-                    measure_costs(names, notes, lambda at: progress.update(task, completed=at))
-                    if costs
-                    else {}
-                )
-            lines = []
-            for i, (file, trial) in enumerate(usable):
-                with _progress() as progress:
-                    task = progress.add_task(f"{trial.name} on {runtime}", total=None)
-                    done = compare(
-                        *(file, trial, names, found, runtime, seconds),
-                        not through_chips and runtime != "rp2040",
-                        jobs,
-                        lambda at, of, task=task, bar=progress: bar.update(
-                            task, completed=at, total=of
-                        ),
-                    )
-                show(done, console)
-                lines += rows(done)
-                if png and done.lines and not no_picture:
-                    try:
-                        for picture in draw(done, files[i], seconds):
-                            console.print("picture:", picture, soft_wrap=True)
-                    except plotting.PictureError as why:
-                        no_picture = why
-            console.print()
-            say_notes(notes, console)
-            for remark in REMARKS:
-                console.print(remark, style="dim", highlight=False, soft_wrap=True)
-            if csv:
-                write_csv(lines, csv)
-                console.print("figures:", csv)
-            if not lines:
-                raise score.ScoreError("nothing could be compared")
-            if no_picture:
-                raise no_picture
-        except runtimes.Unavailable as why:
-            _fail(console, f"runtime {runtime} cannot be had here: {why}", 3)
-        except (score.ScoreError, plotting.PictureError, OSError) as why:
-            _fail(console, str(why), 1)
-
-
-def _progress() -> Progress:
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn())
-    return Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True)
-
-
-def _fail(console, message, code):
-    console.print(message, style="red", highlight=False, markup=False, soft_wrap=True)
-    raise typer.Exit(code) from None
+        names = choose(filters, baselines, notes)
+        runtimes.interpreter(runtime)
+        usable = score.load(score.find(where), seconds, notes, truthless=True)
+        if not usable:
+            raise Wrong("\n".join([*notes, "no trial to compare on"]))
+        files = picture_files(png, [trial.name for _, trial in usable]) if png else []
+        found = {}
+        if costs:
+            with console.progress("costs of an update", len(names)) as at:
+                found = measure_costs(names, notes, at)
+        lines = []
+        for i, (file, trial) in enumerate(usable):
+            with console.progress(f"{trial.name} on {runtime}") as at:
+                direct = not through_chips and runtime != "rp2040"
+                done = compare(file, trial, names, found, runtime, seconds, direct, jobs, at)
+            show(done)
+            lines += rows(done)
+            if png and done.lines and not no_picture:
+                try:
+                    for picture in draw(done, files[i], seconds):
+                        console.say(f"picture: {picture}")
+                except (runtimes.Unavailable, Wrong, OSError) as why:
+                    no_picture = why
+        console.say()
+        score.say_notes(notes)
+        for remark in REMARKS:
+            console.say(remark, "dim")
+        if csv:
+            console.write_csv(csv, COLUMNS, lines)
+            console.say(f"figures: {csv}")
+        if not lines:
+            raise Failed("nothing could be compared")
+        if no_picture:
+            raise no_picture

@@ -2,20 +2,32 @@
 
 import hashlib
 import random
-import sys
 import tempfile
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console, Group
+import typer
+from rich.console import Group
 from rich.live import Live
-from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-from upright_host import oled, paths, runtimes, scoring, simulate, trials
+from upright_host import (
+    console,
+    library,
+    oled,
+    options,
+    paths,
+    registry,
+    replay,
+    runtimes,
+    scoring,
+    simulate,
+    trials,
+)
+from upright_host.console import Wrong
 
 FRAME_MS = 100
 WORLD_HZ = 1000
@@ -39,19 +51,12 @@ class Source:
     dmp_image: Path | None = None  # of the filter dmp6; None: a stand-in
 
 
-def boards() -> list[str]:
-    """The folders of boards/."""
-    return sorted(folder.name for folder in paths.BOARDS.iterdir() if folder.is_dir())
-
-
 def motion_source(name: str, seconds: float | None, board_name: str = "sim") -> Source:
-    """A synthetic motion with the errors of a typical MPU6050. Raises ValueError for an unknown name."""
-    sys.path.insert(0, str(paths.SIMULATOR))
-    import motions
-
+    """A synthetic motion with the errors of a typical MPU6050. Raises Wrong for an unknown name."""
+    motions = library.simulator("motions")
     seconds = seconds or MOTION_SECONDS
     if name not in motions.MOTIONS:
-        raise ValueError(f"unknown motion {name!r}; there are {', '.join(motions.MOTIONS)}")
+        raise Wrong(f"unknown motion {name!r}; there are {', '.join(motions.MOTIONS)}")
     motion = motions.render(name, rate=(WORLD_HZ, 1), seconds=seconds)
 
     def write(path):
@@ -210,49 +215,36 @@ def compare(outcomes: list[Outcome]) -> Table:
     return table
 
 
-def show(source: Source, runtime: str, headless: bool, speed: float | None, console: Console):
-    """Run with a live display in the terminal (or, headless, a progress bar) -> Outcome."""
-    live = console.is_terminal and not headless
-    if speed is None:
-        speed = max(1.0, source.seconds / SHOW_SECONDS)
-    progress = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.fields[at]}"),
-        console=console,
-    )
-    task = progress.add_task(source.name, total=source.seconds, at="")
-    lines: list[str] = []
-    if not live:
-        with progress:
-
-            def on_frame(at, _):
-                progress.update(task, completed=at, at=f"{at:.0f} of {source.seconds:.0f} s")
-
+def show(source: Source, runtime: str, headless: bool, speed: float | None) -> Outcome:
+    """Run with a live display in the terminal, or, headless, with a progress bar."""
+    where = console.out
+    if headless or not where.is_terminal:
+        with console.progress(source.name, source.seconds, where) as at:
             outcome = run(
-                source,
-                runtime,
-                on_frame,
-                lambda line: console.print("board:", line, highlight=False),
+                source, runtime, lambda now, _: at(now), lambda line: console.say(f"board: {line}")
             )
         if outcome.frames:
-            console.print(oled.panel(oled.rows_of_frame(outcome.frames[-1][1]), console.width))
+            where.print(oled.panel(oled.rows_of_frame(outcome.frames[-1][1]), where.width))
         return outcome
 
+    if speed is None:
+        speed = max(1.0, source.seconds / SHOW_SECONDS)
+    shown = console.bars(where)
+    task = shown.add_task("", total=source.seconds)
+    lines: list[str] = []
     began = time.monotonic()
-    with Live(console=console, refresh_per_second=12, transient=False) as view:
+    with Live(console=where, refresh_per_second=12) as view:
 
         def on_frame(at, picture):
             if speed:
                 time.sleep(max(0.0, at / speed - (time.monotonic() - began)))
-            progress.update(
-                task, completed=at, at=f"{at:.1f} of {source.seconds:.0f} s, x{speed:.3g}"
-            )
+            text = f"{source.name}: {at:.1f} of {source.seconds:.0f} s, x{speed:.3g}"
+            shown.update(task, completed=at, description=text)
             rows = oled.rows_of_frame(picture or bytes(1024))
             view.update(
                 Group(
-                    oled.panel(rows, console.width, title="128x64 OLED"),
-                    progress.get_renderable(),
+                    oled.panel(rows, where.width, title="128x64 OLED"),
+                    shown.get_renderable(),
                     Text("\n".join(lines[-4:]), style="dim"),
                 )
             )
@@ -276,3 +268,61 @@ def save_gif(outcome: Outcome, path: Path):
             shown += 1
         pictures.append(oled.rows_of_frame(outcome.frames[shown][1]))
     oled.save_gif(pictures, path, FRAME_MS)
+
+
+def register(app: typer.Typer) -> None:
+    """Give an app the command `demo`."""
+
+    @app.command("demo")
+    def demo_command(
+        trial: Path = typer.Option(None, help="Feed this recorded trial (.npz) through the chip."),
+        motion: str = typer.Option("demo", help="Synthetic motion, when there is no --trial."),
+        board: str = typer.Option(
+            None,
+            help="The board to simulate, a folder of boards/ (sim; with nine axes robomaster_a).",
+        ),
+        filters: str = typer.Option(
+            None,
+            help="Run it with each of these filters, a,b,... and compare (default: the board's).",
+        ),
+        headless: bool = typer.Option(
+            False, help="No live display: progress, the last picture, the figures."
+        ),
+        seconds: float = options.seconds("Simulated time (25; of a trial, all of it)."),
+        speed: float = typer.Option(None, min=0, help="Times real time; 0: as fast as it goes."),
+        png: Path = options.output("Save the display's last picture."),
+        gif: Path = options.output("Save all that the display showed as an animation."),
+        dmp_image: Path = typer.Option(
+            None, exists=True, dir_okay=False, help="The DMP's image for dmp6 (a stand-in)."
+        ),
+        runtime: str = options.runtime(),
+    ):
+        """Boot the firmware on a simulated board: MPU6050, filter in a hard timer tick, OLED; how far off it was."""
+        names = registry.listed(filters) if filters else [None]
+        nine = next((name for name in names if name and registry.axes(name) == 9), None)
+        board = paths.known_board(board or (replay.board_for(nine) if nine else "sim"))
+        if trial and "dmp6" in names:
+            raise Wrong("dmp6 samples by a clock of its own: it cannot follow a --trial")
+        source = (
+            trial_source(trial, seconds, board) if trial else motion_source(motion, seconds, board)
+        )
+        source.dmp_image = dmp_image
+        runtime = runtime or simulate.best_runtime()
+        outcomes = []
+        for name in names:
+            if name:
+                source.board["FILTER"] = name
+            outcomes.append(show(source, runtime, headless or bool(outcomes), speed))
+            for line in summary(outcomes[-1]):
+                console.say(line)
+        if len(outcomes) > 1:
+            console.out.print(compare(outcomes))
+        for what, path, save in (("picture", png, save_png), ("animation", gif, save_gif)):
+            if path:
+                with console.writing(path):
+                    save(outcomes[0], path)
+                console.say(f"{what}: {path}")
+        if any(
+            not r["started"] or r["crashes"] or r["uncaught"] for r in (o.result for o in outcomes)
+        ):
+            raise typer.Exit(console.FAILED)

@@ -5,13 +5,12 @@ header; --out makes of that the binary file that a board reads.
 """
 
 import re
-import sys
 from pathlib import Path
 
 import typer
-from rich.console import Console
 
-from upright_host import paths
+from upright_host import console, library, options
+from upright_host.console import Wrong
 
 # Whole files that are known, by SHA-256; mpu_dmp_image.KNOWN has the same keys
 KNOWN = {
@@ -38,17 +37,13 @@ _ARRAY = re.compile(
 _TEXT_TO_LOOK_AT = 4096
 
 
-class ImageError(ValueError):
+class ImageError(Wrong):
     """What is wrong with a file, in one line."""
 
 
 def _image_module():
     """lib/upright/dmp_image.py, which knows the layouts."""
-    if str(paths.LIB) not in sys.path:
-        sys.path.append(str(paths.LIB))  # last: nothing of the host may be hidden by it
-    from upright import dmp_image as mpu_dmp_image
-
-    return mpu_dmp_image
+    return library.upright("dmp_image")
 
 
 def read(files: list[Path]) -> tuple[bytes, list[str]]:
@@ -181,16 +176,15 @@ def register(app: typer.Typer) -> None:
         files: list[Path] = typer.Argument(
             ..., metavar="FILE...", help="The image; behind it, if need be, the files of its lists."
         ),
-        out: Path = typer.Option(
-            None, help="Write the image and its lists to this file, as a board reads it."
+        out: Path = options.output(
+            "Write the image and its lists to this file, as a board reads it."
         ),
         sha256: str = typer.Option(None, help="The SHA-256 that it is to have."),
     ):
-        """Say which image of the DMP a file is, whether it is known, and what it needs; 1 when it is none.
+        """Say which image of the DMP a file is, whether it is known, and what it needs; exit code 2 when it is none.
 
         A C header (or Python file) with the image as an array is understood as well, with --out.
         """
-        console = Console(soft_wrap=True, highlight=False, markup=False)
         named = ", ".join(str(path) for path in files)
         try:
             data, arrays = read(files)
@@ -199,15 +193,12 @@ def register(app: typer.Typer) -> None:
                     f"text, with the arrays {', '.join(arrays)}: --out dmp.bin makes a binary file of them"
                 )
             lines = describe(data, sha256)
-            if out:
-                try:
-                    out.write_bytes(data)
-                except OSError as why:
-                    raise ImageError(f"{out} cannot be written: {why.strerror or why}") from why
-                lines.append(f"written to     {out}, {len(data)} bytes")
         except ImageError as why:
             text = str(why)
-            console.print(text if text.startswith(named) else f"{named}: {text}", style="red")
-            raise typer.Exit(1) from None
+            raise Wrong(text if text.startswith(named) else f"{named}: {text}") from None
+        if out:
+            with console.writing(out):
+                out.write_bytes(data)
+            lines.append(f"written to     {out}, {len(data)} bytes")
         for line in lines:
-            console.print(line)
+            console.say(line)

@@ -58,7 +58,7 @@ def examine_simulated(board: str, runtime: str, on_line, **parts) -> list[str]:
     result = simulate.run(
         runtime,
         DOCTOR,
-        {"board_name": board} | parts,
+        {"board_name": paths.known_board(board)} | parts,
         lambda kind, fields: on_line(fields[0]) if kind == "console" else None,
     )
     return result["problems"]

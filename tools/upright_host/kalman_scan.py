@@ -7,14 +7,14 @@ can take the accelerometer's place.
 
 import math
 import multiprocessing
-import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
-from upright_host import paths, plotting, registry, replay, simulate, trials
+from upright_host import library, plotting, registry, replay, simulate, trials
+from upright_host.console import Wrong
 
 USUAL = (10.0, 0.05)  # Q, R in deg**2: the values that are widely copied
 # half decades about them
@@ -27,10 +27,6 @@ COLUMNS = ("Q", "R", "ratio", "K", "settling_s", "lag_s", "noise_deg", "rmse_deg
 _STEP = 100000  # millideg
 _NEAR = 0.02  # of a step
 _LONGEST_S = 60
-
-
-class TuneError(ValueError):
-    """Nothing can be tuned; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -103,10 +99,10 @@ def signal(
 ) -> Signal:
     """An angle of a trial as the accelerometer alone shows it, or a filter of the registry.
 
-    Raises TuneError, and what replay.replay raises.
+    Raises Wrong, and what replay.replay raises.
     """
     if axis not in AXES:
-        raise TuneError(f"unknown axis {axis!r}; there are {', '.join(AXES)}")
+        raise Wrong(f"unknown axis {axis!r}; there are {', '.join(AXES)}")
     n = trial.rows(seconds)
     if source == ACCELEROMETER:
         x, y, z = trial.counts[:n, :3].astype(float).T
@@ -114,7 +110,7 @@ def signal(
         angle = np.degrees(angle)
     elif source not in registry.filters():
         names = ", ".join([ACCELEROMETER, *registry.filters()])
-        raise TuneError(f"unknown source {source!r}; there are {names}")
+        raise Wrong(f"unknown source {source!r}; there are {names}")
     else:
         done = replay.replay(
             trial, source, runtime or simulate.best_runtime(), seconds, direct=True
@@ -148,13 +144,7 @@ def _stillest(gyro, rate) -> slice:
 # ------------------------------------------------------------------------------------------- the filter
 def kalman_filter():
     """lib/upright/kalman.py's KalmanFilter, which needs nothing of a board's."""
-    for folder in (paths.LIB, paths.SHIM):
-        if str(folder) not in sys.path:
-            sys.path.append(str(folder))  # last: nothing of the host may be hidden by it
-    import micropython  # noqa: F401 (the stand-in: it prepares what lib's modules import)
-    from upright.kalman import KalmanFilter
-
-    return KalmanFilter
+    return library.upright("kalman").KalmanFilter
 
 
 def filtered(z: list, Q: float, R: float) -> np.ndarray:

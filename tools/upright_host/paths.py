@@ -1,7 +1,11 @@
 """Where things are: the project's rooms, the cache, and the search path that stands in for a board's file system."""
 
+import contextlib
+import fcntl
 import os
 from pathlib import Path
+
+from upright_host.console import Wrong
 
 ROOT = Path(__file__).resolve().parents[2]
 LIB = ROOT / "lib"
@@ -22,6 +26,26 @@ def cache() -> Path:
     folder = Path(folder).absolute()
     folder.mkdir(parents=True, exist_ok=True)
     return folder
+
+
+@contextlib.contextmanager
+def locked(name: str):
+    """One process at a time fills a place of the cache."""
+    with open(cache() / f".{name}.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def boards() -> list[str]:
+    """The folders of boards/."""
+    return sorted(folder.name for folder in BOARDS.iterdir() if folder.is_dir())
+
+
+def known_board(name: str) -> str:
+    """-> the name. Raises Wrong where boards/ has no folder of it."""
+    if name not in boards():
+        raise Wrong(f"unknown board {name!r}; there are {', '.join(boards())}")
+    return name
 
 
 def board_path(board: str = "sim", simulated: bool = True) -> list[Path]:

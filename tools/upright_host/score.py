@@ -4,7 +4,6 @@ Every replay is a process of its own, several at a time. What cannot be used (a 
 package that is not installed) is named and left out. The measure is scoring.py's; docs/accuracy.md shows results.
 """
 
-import csv
 import json
 import math
 import os
@@ -18,11 +17,21 @@ from pathlib import Path
 
 import numpy as np
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from upright_host import baselines, plotting, registry, replay, runtimes, scoring, simulate, trials
+from upright_host import (
+    baselines,
+    console,
+    options,
+    plotting,
+    registry,
+    replay,
+    runtimes,
+    scoring,
+    simulate,
+    trials,
+)
+from upright_host.console import Failed, Wrong
 
 FILTERS = "mahony6,mahony9,inertial6,inertial9,inertial9-lite"
 COLUMNS = (
@@ -34,12 +43,11 @@ STATISTICS = {"mean": np.mean, "median": np.median, "worst": np.max}
 FIGURES = ("inclination", "heading", "total")
 AS_GIVEN, BEST = "as given", "best heading"
 _NO_SCORE = scoring.Score(*[math.nan] * 7, samples=0, coverage=0.0)
+BASELINES_OPTION = typer.Option(
+    False, "--baselines", help="All of other people's filters beside: vqf, ahrs, imufusion."
+)
 # What headers say when true north is not known, or not well enough
 _NO_NORTH = ("best heading", "best-heading", "heading arbitrary")
-
-
-class ScoreError(ValueError):
-    """There is nothing to score, or no way to; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +62,7 @@ class Row:
     measure: str
     score: scoring.Score
     q: np.ndarray | None = field(default=None, repr=False, compare=False)
+    axes: int = 6
 
     @property
     def inclination(self) -> float:
@@ -107,8 +116,8 @@ def knows_north(trial: trials.Trial) -> bool:
 
 
 def axes_of(name: str) -> int:
-    """Of a filter or baseline, by its name."""
-    return 9 if "9" in name else 6
+    """Of a filter or baseline."""
+    return baselines.BASELINES[name][1] if name in baselines.BASELINES else registry.axes(name)
 
 
 def measure_of(trial: trials.Trial, name: str) -> str:
@@ -118,14 +127,14 @@ def measure_of(trial: trials.Trial, name: str) -> str:
 
 
 def find(paths: list[Path]) -> list[Path]:
-    """The .npz files of folders (not of what lies in these), and files as named. Raises ScoreError."""
+    """The .npz files of folders (not of what lies in these), and files as named. Raises Wrong."""
     found = []
     for path in paths:
         path = Path(path)
         if path.is_dir():
             inside = sorted(path.glob("*.npz"))
             if not inside:
-                raise ScoreError(f"no trials (.npz) in {path}")
+                raise Wrong(f"no trials (.npz) in {path}")
             found += inside
         else:
             found.append(path)
@@ -172,31 +181,25 @@ def run(
 ) -> Report:
     """Score filters, and baselines, on trials. on_progress(done, of) counts rows; it is called from several threads.
 
-    Raises ScoreError when nothing at all can be scored, and runtimes.Unavailable.
+    Raises Wrong without a usable trial, Failed when nothing could be scored, and runtimes.Unavailable.
     """
     report = Report()
     names = wanted(filters, with_baselines, report.notes)
     runtimes.interpreter(runtime)
     usable = load(files, seconds, report.notes)
     if not usable:
-        raise ScoreError("\n".join([*report.notes, "no trial to score"]))
+        raise Wrong("\n".join([*report.notes, "no trial to score"]))
     replay_all(report, usable, names, runtime, seconds, direct, jobs, on_progress)
     if not report.rows:
-        raise ScoreError("\n".join([*report.notes, "nothing could be scored"]))
+        raise Failed("\n".join([*report.notes, "nothing could be scored"]))
     return report
 
 
 def wanted(filters: list[str], with_baselines: bool, notes: list) -> list[str]:
-    """The names of filters and baselines, each once; what is not installed goes into notes. Raises ScoreError."""
-    if not filters:
-        raise ScoreError("no filter to score")
-    known = [*registry.filters(), *baselines.BASELINES]
-    for name in filters:
-        if name not in known:
-            raise ScoreError(f"unknown filter {name!r}; there are {', '.join(known)}")
-    return _obtainable(
-        dict.fromkeys([*filters, *(baselines.BASELINES if with_baselines else ())]), notes
-    )
+    """The names of filters and baselines, each once; what is not installed goes into notes. Raises Wrong."""
+    names = registry.listed(",".join(filters), baselines.BASELINES)
+    more = baselines.BASELINES if with_baselines else ()
+    return _obtainable(dict.fromkeys([*names, *more]), notes)
 
 
 def replay_all(
@@ -229,13 +232,15 @@ def replay_all(
                 )
                 q = done.q29 / scoring.ONE
             score = scoring.score_trial(q, trial) if trial.has_truth else _NO_SCORE
-        except (simulate.SimulationError, ValueError, OSError) as why:
+        except (Failed, ValueError, OSError) as why:
             return f"left out: {name} on {trial.name}: {_last_line(why)}"
         finally:
             count(trial.rows(seconds))
         if not keep and (not score.samples or not math.isfinite(score.total)):
             return f"left out: {name} on {trial.name}: no sample of it meets the truth"
-        return Row(trial.name, name, measure_of(trial, name), score, q if keep else None)
+        return Row(
+            trial.name, name, measure_of(trial, name), score, q if keep else None, axes_of(name)
+        )
 
     # a thread only waits for its process
     with ThreadPoolExecutor(jobs or os.cpu_count() or 1) as pool:
@@ -265,7 +270,7 @@ def _baseline(name, file, trial, seconds):
             [*argv, str(trial.rows(seconds)), str(out)], capture_output=True, text=True
         )
         if done.returncode:
-            raise simulate.SimulationError(done.stderr.strip() or f"ended with {done.returncode}")
+            raise Failed(done.stderr.strip() or f"ended with {done.returncode}")
         return np.fromfile(out).reshape(-1, 4)
 
 
@@ -338,26 +343,30 @@ def trial_table(report: Report, trial: str) -> Table:
     return table
 
 
-def show(report: Report, console: Console) -> None:
+def show(report: Report) -> None:
     """The tables and what was left out, for people."""
     for trial in report.names("trial"):
-        console.print(f"\n{trial}", style="bold", highlight=False, markup=False)
-        console.print(trial_table(report, trial))
+        console.say(f"\n{trial}", "bold")
+        console.out.print(trial_table(report, trial))
     if report.notes:
-        console.print()
-    for note in report.notes:
-        console.print(note, style="yellow", highlight=False, markup=False, soft_wrap=True)
+        console.say()
+    say_notes(report.notes)
     trials_in_all = len(report.names("trial"))
     over = f"over {trials_in_all} trial" + "s" * (trials_in_all != 1)
-    console.print("\n" + over, style="bold", highlight=False)
-    console.print(summary_table(report))
-    console.print(
+    console.say("\n" + over, "bold")
+    console.out.print(summary_table(report))
+    console.say(
         "heading and total: as given for nine axes where the truth knows north, else after the best constant heading",
-        style="dim",
+        "dim",
     )
     trials_of = {len([r for r in report.rows if r.filter == f]) for f in report.names("filter")}
     if len(trials_of) > 1:
-        console.print("not every filter was scored on every trial: compare with care", style="red")
+        console.say("not every filter was scored on every trial: compare with care", "red")
+
+
+def say_notes(notes) -> None:
+    for note in notes:
+        console.say(note, "yellow")
 
 
 def write_csv(report: Report, path: Path) -> None:
@@ -365,37 +374,19 @@ def write_csv(report: Report, path: Path) -> None:
 
     Angles in degrees; heading and total by heading_measure.
     """
-    with open(path, "w", newline="", encoding="utf-8") as file:
-        out = csv.writer(file, lineterminator="\n")
-        out.writerow(COLUMNS)
-        for row in report.rows:
-            out.writerow([_cell(value) for value in row.cells()])
-        for statistic in STATISTICS:
-            for name in report.names("filter"):
-                values = [report.statistic(statistic, name, figure) for figure in FIGURES]
-                measures = {row.measure for row in report.rows if row.filter == name}
-                measure = measures.pop() if len(measures) == 1 else "mixed"
-                cells = [statistic, name, measure, *values]
-                cells += [""] * (len(COLUMNS) - len(cells))
-                out.writerow([_cell(value) for value in cells])
-
-
-def _cell(value):
-    return f"{value:.4f}" if isinstance(value, float) else value
+    rows = [row.cells() for row in report.rows]
+    for statistic in STATISTICS:
+        for name in report.names("filter"):
+            values = [report.statistic(statistic, name, figure) for figure in FIGURES]
+            measures = {row.measure for row in report.rows if row.filter == name}
+            measure = measures.pop() if len(measures) == 1 else "mixed"
+            cells = [statistic, name, measure, *values]
+            rows.append(cells + [None] * (len(COLUMNS) - len(cells)))
+    console.write_csv(path, COLUMNS, rows)
 
 
 def save_png(report: Report, path: Path) -> None:
-    """Bars of inclination and total for each trial and filter, and their means.
-
-    Raises ScoreError where matplotlib is not installed, or the file cannot be written.
-    """
-    try:
-        _draw(report, path)
-    except plotting.PictureError as why:
-        raise ScoreError(str(why)) from why
-
-
-def _draw(report, path):
+    """Bars of inclination and total for each trial and filter, and their means. Raises what plotting does."""
     names, filters = report.names("trial"), report.names("filter")
     groups = [*names, f"mean_of all {len(names)}"] if len(names) > 1 else names
     by = {(row.trial, row.filter): row for row in report.rows}
@@ -466,56 +457,32 @@ def register(app: typer.Typer) -> None:
         filters: str = typer.Option(
             FILTERS, help="Filters, with commas between; baselines may be among them."
         ),
-        runtime: str = typer.Option(
-            None, help="cpython, unix, unix32 or arm (default: unix where it can be had)."
-        ),
-        baselines: bool = typer.Option(
-            False, "--baselines", help="All of other people's filters beside: vqf, ahrs, imufusion."
-        ),
-        csv: Path = typer.Option(None, help="Write the figures to this file."),
-        png: Path = typer.Option(None, help="Draw them."),
-        seconds: float = typer.Option(None, help="Only the first so many seconds of each trial."),
+        runtime: str = options.runtime(),
+        baselines: bool = BASELINES_OPTION,
+        csv: Path = options.output("Write the figures to this file."),
+        png: Path = options.output("Draw them."),
+        seconds: float = options.seconds("Only the first so many seconds of each trial."),
         through_chips: bool = typer.Option(
             False,
             "--through-chips",
             help="Through the simulated chips, the drivers and the tick; slow.",
         ),
-        jobs: int = typer.Option(None, min=1, help="Replays at a time (default: one a processor)."),
+        jobs: int = options.jobs("Replays"),
     ):
         """Score filters on a folder of recorded trials: RMSE of inclination, heading and total; mean, median, worst."""
-        if seconds is not None and not seconds > 0:
-            raise typer.BadParameter(f"{seconds} is not a positive number of seconds")
-        console, runtime = Console(), runtime or simulate.best_runtime()
-        names = list(dict.fromkeys(name.strip() for name in filters.split(",") if name.strip()))
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TaskProgressColumn(),
-            TimeRemainingColumn(),
-        )
-        try:
-            with Progress(*columns, console=Console(stderr=True)) as progress:
-                task = progress.add_task(f"replaying on {runtime}", total=None)
-                report = run(
-                    *(find(where), names, runtime, seconds),
-                    direct=not through_chips,
-                    with_baselines=baselines,
-                    jobs=jobs,
-                    on_progress=lambda at, of: progress.update(task, completed=at, total=of),
-                )
-            show(report, console)
-            if csv:
-                write_csv(report, csv)
-                console.print("figures:", csv)
-            if png:
-                save_png(report, png)
-                console.print("picture:", png)
-        except runtimes.Unavailable as why:
-            _fail(console, f"runtime {runtime} cannot be had here: {why}", 3)
-        except (ScoreError, OSError) as why:
-            _fail(console, str(why), 1)
-
-
-def _fail(console, message, code):
-    console.print(message, style="red", highlight=False, markup=False, soft_wrap=True)
-    raise typer.Exit(code) from None
+        runtime = runtime or simulate.best_runtime()
+        with console.progress(f"replaying on {runtime}") as at:
+            report = run(
+                *(find(where), filters.split(","), runtime, seconds),
+                direct=not through_chips,
+                with_baselines=baselines,
+                jobs=jobs,
+                on_progress=at,
+            )
+        show(report)
+        if csv:
+            write_csv(report, csv)
+            console.say(f"figures: {csv}")
+        if png:
+            save_png(report, png)
+            console.say(f"picture: {png}")

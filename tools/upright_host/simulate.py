@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from upright_host import paths, runtimes
+from upright_host.console import Failed
 
 REPLAY = paths.SIMULATOR / "run_replay.py"
 FIRMWARE = paths.SIMULATOR / "run_firmware.py"
 
 
-class SimulationError(RuntimeError):
+class SimulationError(Failed):
     """The script did not run to its end; the message holds the last lines that it said."""
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from upright_host import paths, runtimes
+from upright_host.console import Failed
 
 START = "run.py"  # in the folder of compile_for()
 
@@ -16,7 +17,7 @@ START = "run.py"  # in the folder of compile_for()
 _ARCHITECTURES = {5: "armv7m", 6: "armv7em", 7: "armv7emsp", 8: "armv7emdp"}
 
 
-class TraceError(RuntimeError):
+class TraceError(Failed):
     """A measurement did not run to its end; the message says which, and what was said last."""
 
 

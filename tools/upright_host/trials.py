@@ -9,7 +9,6 @@ absent, and so may q_gt with movement.
 import json
 import math
 import os
-import sys
 import zipfile
 from dataclasses import dataclass
 from fractions import Fraction
@@ -17,7 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from upright_host import paths
+from upright_host import library, paths
+from upright_host.console import Wrong
 
 STANDARD_GRAVITY = 9.80665  # m/s2
 ACCEL_RANGES = {16384: 2, 8192: 4, 4096: 8, 2048: 16}  # LSB per g: range in g
@@ -26,7 +26,7 @@ BESIDE = Path("..", "shared", "data")  # from the project root: where trials may
 _SCALE_TOLERANCE = 1e-4  # relative: lets float32 pass, not 9.81 for 9.80665
 
 
-class TrialError(ValueError):
+class TrialError(Wrong):
     """A file is not a usable trial; the message says which file and what is wrong with it."""
 
 
@@ -102,7 +102,7 @@ class Trial:
     def write(self, path, seconds: float | None = None) -> int:
         """Write the first `seconds` (None: all) as the `.imu` file to replay; returns the rows."""
         rows = self.rows(seconds)
-        _world().write_imu(
+        library.simulator("world").write_imu(
             path,
             self.counts[:rows].astype("<i2").tobytes(),
             self.name,
@@ -300,12 +300,3 @@ def _truth(path: Path, arrays: dict, header: dict, n: int) -> tuple:
             f"{path}: movement is {bits.dtype} {bits.shape}, expected uint8 ({-(-m // 8)},)"
         )
     return every, q_gt, np.unpackbits(bits)[:m].astype(bool)
-
-
-def _world():
-    """The simulator's world module, which owns the `.imu` format."""
-    if str(paths.SIMULATOR) not in sys.path:
-        sys.path.append(str(paths.SIMULATOR))  # last: nothing of the host may be hidden by it
-    import world
-
-    return world

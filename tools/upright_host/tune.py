@@ -1,15 +1,13 @@
 """`upright tune kalman`: Q and R of the scalar Kalman filter scanned on a recorded trial; table, sentences, picture."""
 
-import csv
 from pathlib import Path
 
 import numpy as np
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from upright_host import plotting, runtimes, simulate, trials
+from upright_host import console, options, plotting, trials
+from upright_host.console import Wrong
 from upright_host.kalman_scan import (
     ACCELEROMETER,
     COLUMNS,
@@ -19,7 +17,6 @@ from upright_host.kalman_scan import (
     USUAL,
     Setting,
     Signal,
-    TuneError,
     advised,
     best,
     by_ratio,
@@ -91,15 +88,6 @@ def remarks(of: Signal, found: list[Setting]) -> list[str]:
     ]
 
 
-def write_csv(found: list[Setting], path: Path) -> None:
-    """COLUMNS: a row for each pair. Q, R in deg**2."""
-    with open(path, "w", newline="", encoding="utf-8") as file:
-        out = csv.writer(file, lineterminator="\n")
-        out.writerow(COLUMNS)
-        for s in found:
-            out.writerow(["" if cell is None else f"{cell:.6g}" for cell in s.cells()])
-
-
 # ------------------------------------------------------------------------------------------- pictures
 _GREY, _TRUTH = "0.8", "black"
 _MOTION_S = 8.0
@@ -107,7 +95,7 @@ _ZOOM_S = 1.2
 
 
 def draw_scan(of: Signal, found: list[Setting], name: str, path: Path) -> None:
-    """The RMSE over Q and R, over Q/R alone, and what four pairs make of the angle. Raises plotting.PictureError."""
+    """The RMSE over Q and R, over Q/R alone, and what four pairs make of the angle. Raises what plotting does."""
     picture = plotting.figure(14, 9.5)
     places = picture.add_gridspec(2, 2, width_ratios=(1, 1.25))
     _heat_map(picture, picture.add_subplot(places[0, 0]), found)
@@ -201,7 +189,7 @@ def _all_on_one_line(panel, found):
 def draw_waveform(trial: trials.Trial, path: Path, seconds: float | None = None) -> None:
     """The pitch of the accelerometer alone, as it comes and filtered; and how K and P settle.
 
-    With Q and R as they are widely copied, and with the Q that is best at this R. Raises plotting.PictureError.
+    With Q and R as they are widely copied, and with the Q that is best at this R. Raises what plotting does.
     """
     of = signal(trial, seconds=seconds)
     R = USUAL[1]
@@ -318,49 +306,29 @@ def register(app: typer.Typer) -> None:
         source: str = typer.Option(
             ACCELEROMETER, help="Whose angle: accelerometer, or a filter of the registry."
         ),
-        runtime: str = typer.Option(
-            None, help="For a filter's angle: cpython, unix, unix32 or arm (default: unix)."
-        ),
-        csv: Path = typer.Option(None, help="Write the figures of every pair to this file."),
-        png: Path = typer.Option(None, help="Draw them, and waveforms."),
-        seconds: float = typer.Option(None, help="Only the first so many seconds."),
-        jobs: int = typer.Option(None, min=1, help="Filters at a time (default: one a processor)."),
+        runtime: str = options.runtime(help="For a filter's angle: "),
+        csv: Path = options.output("Write the figures of every pair to this file."),
+        png: Path = options.output("Draw them, and waveforms."),
+        seconds: float = options.seconds(),
+        jobs: int = options.jobs("Filters"),
     ):
         """The scalar Kalman filter for many Q and R: what they come to, and what the usual advice does."""
-        console = Console()
-        if seconds is not None and not seconds > 0:
-            raise typer.BadParameter(f"{seconds} is not a positive number of seconds")
-        try:
-            loaded = trials.load(trial)
-            of = signal(loaded, axis, source, runtime, seconds)
-            if of.truth is None:
-                raise TuneError(f"{trial}: no truth in it, or in this span: nothing to tune by")
-            pairs = grid()
-            columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn())
-            with Progress(
-                *columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True
-            ) as progress:
-                task = progress.add_task(f"{len(pairs)} pairs of Q and R", total=len(pairs))
-                found = scan(of, pairs, jobs, lambda at: progress.update(task, completed=at))
-            title = (
-                f"{loaded.name}: {axis} of {_source(of)}, {len(of.z)} samples at {of.rate:.1f} Hz"
-            )
-            console.print(title, style="bold", highlight=False, markup=False, soft_wrap=True)
-            console.print(table(found))
-            for line in remarks(of, found):
-                console.print(line, highlight=False, soft_wrap=True)
-            if csv:
-                write_csv(found, csv)
-                console.print("figures:", csv)
-            if png:
-                draw_scan(of, found, loaded.name, png)
-                console.print("picture:", png)
-        except runtimes.Unavailable as why:
-            _fail(console, f"runtime {runtime} cannot be had here: {why}", 3)
-        except (ValueError, OSError, simulate.SimulationError) as why:
-            _fail(console, str(why), 1)
-
-
-def _fail(console, message, code):
-    console.print(message, style="red", highlight=False, markup=False, soft_wrap=True)
-    raise typer.Exit(code) from None
+        loaded = trials.load(trial)
+        of = signal(loaded, axis, source, runtime, seconds)
+        if of.truth is None:
+            raise Wrong(f"{trial}: no truth in it, or in this span: nothing to tune by")
+        pairs = grid()
+        with console.progress(f"{len(pairs)} pairs of Q and R", len(pairs)) as at:
+            found = scan(of, pairs, jobs, at)
+        title = f"{loaded.name}: {axis} of {_source(of)}, {len(of.z)} samples at {of.rate:.1f} Hz"
+        console.say(title, "bold")
+        console.out.print(table(found))
+        for line in remarks(of, found):
+            console.say(line)
+        if csv:
+            # Q, R in deg**2: a row for each pair
+            console.write_csv(csv, COLUMNS, (s.cells() for s in found), ".6g")
+            console.say(f"figures: {csv}")
+        if png:
+            draw_scan(of, found, loaded.name, png)
+            console.say(f"picture: {png}")

@@ -1,0 +1,141 @@
+"""Recordings of a board's counts: `.imu` as the board writes them, `.npz` (a trial), `.csv`."""
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from upright_host import library, trials
+from upright_host.console import Wrong
+
+COLUMNS = ("ax", "ay", "az", "gx", "gy", "gz", "mx", "my", "mz", "temp", "flags")
+
+
+@dataclass
+class Recording:
+    """Counts of a recording, in the chips' own frames.
+
+    counts           int64 (n, 11), the columns COLUMNS
+    rate             rows per second; None where nobody said
+    accel_lsb_per_g, gyro_scale    of the counts; gyro_scale is (num, den) LSB per deg/s
+    mag_lsb_per_uT   float or None
+    chip, board      names or None
+    """
+
+    name: str
+    counts: np.ndarray
+    rate: float | None
+    accel_lsb_per_g: int
+    gyro_scale: tuple
+    mag_lsb_per_uT: float | None = None
+    chip: str | None = None
+    board: str | None = None
+
+    def fresh(self, bit: int) -> np.ndarray:
+        """Which rows hold a fresh sample, bool (n,): where no row has a flag, all do."""
+        flags = self.counts[:, 10]
+        return (flags & bit) != 0 if flags.any() else np.ones(len(flags), bool)
+
+    def inertial(self) -> tuple[np.ndarray, np.ndarray]:
+        """Fresh rows as (accelerometer in g, gyro in deg/s), float (m, 3) each; an axis at full scale is an error."""
+        rows = self.counts[self.fresh(1)]
+        if not len(rows):
+            raise Wrong(f"{self.name}: no fresh sample of accelerometer and gyro in it")
+        if not rows[:, :6].any():
+            raise Wrong(f"{self.name}: the counts of accelerometer and gyro are all 0")
+        num, den = self.gyro_scale
+        return rows[:, :3] / self.accel_lsb_per_g, rows[:, 3:6] * (den / num)
+
+    def magnetic(self) -> np.ndarray:
+        """Fresh rows of the magnetometer, counts, float (m, 3), without those at full scale."""
+        mag = self.counts[self.fresh(2)][:, 6:9]
+        mag = mag[(np.abs(mag) < 32767).all(1)]
+        if not mag.any():
+            raise Wrong(f"{self.name}: no magnetometer sample in it")
+        return mag.astype(float)
+
+
+def load(path: Path, rate=None, accel_range=None, gyro_range=None) -> Recording:
+    """A recording: `.imu`, `.npz` (a trial), or `.csv` of counts. Raises Wrong.
+
+    rate, accel_range (g) and gyro_range (deg/s) are for a .csv, which does not say them.
+    """
+    path = Path(path)
+    try:
+        if path.suffix == ".npz":
+            return _from_trial(path)
+        if path.suffix == ".csv":
+            return _from_csv(path, rate, accel_range or 8, gyro_range or 2000)
+        return _from_imu(path)
+    except FileNotFoundError:
+        raise Wrong(f"{path}: no such file") from None
+
+
+def _from_trial(path: Path) -> Recording:
+    trial = trials.load(path)
+    return Recording(
+        path.name,
+        trial.counts.astype(np.int64),
+        trial.rate[0] / trial.rate[1],
+        trial.accel_lsb_per_g,
+        trial.gyro_scale,
+        1 / trial.mag_uT_per_lsb if trial.mag_uT_per_lsb else None,
+    )
+
+
+def _from_imu(path: Path) -> Recording:
+    try:
+        held = library.simulator("world").World(str(path))
+    except ValueError as why:
+        raise Wrong(str(why)) from why
+    held.close()
+    data = path.read_bytes()
+    end = data.index(b"\n")
+    more = json.loads(data[:end])  # what a board that recorded it says besides
+    scale = more.get("mag_lsb_per_uT")
+    return Recording(
+        path.name,
+        np.frombuffer(data, "<i2", offset=end + 1).reshape(-1, 11).astype(np.int64),
+        held.rate[0] / held.rate[1],
+        held.accel_lsb_per_g,
+        held.gyro_scale,
+        scale[0] / scale[1] if scale else None,
+        more.get("chip"),
+        more.get("board"),
+    )
+
+
+def _from_csv(path: Path, rate, accel_range, gyro_range) -> Recording:
+    lsb = {g: scale for scale, g in trials.ACCEL_RANGES.items()}
+    scale = {dps: pair for pair, dps in trials.GYRO_RANGES.items()}
+    if accel_range not in lsb or gyro_range not in scale:
+        raise Wrong(
+            f"no range of +-{accel_range} g and +-{gyro_range} deg/s; there are "
+            f"{', '.join(map(str, sorted(lsb)))} g and {', '.join(map(str, sorted(scale)))} deg/s"
+        )
+    with open(path, newline="") as file:
+        try:
+            head, *rows = csv.reader(file)
+        except (ValueError, UnicodeDecodeError, csv.Error) as why:
+            raise Wrong(f"{path}: not a CSV file with a header line: {why}") from why
+    names = [name.strip().lower() for name in head]
+    if not set(names) & set(COLUMNS):
+        raise Wrong(f"{path}: the first line names none of the columns {' '.join(COLUMNS)}")
+    counts = np.zeros((len(rows), 11), np.int64)
+    times = []
+    for i, row in enumerate(rows):
+        try:
+            for name, text in zip(names, row, strict=True):
+                if name in COLUMNS:
+                    counts[i, COLUMNS.index(name)] = int(text)
+                elif name == "t":
+                    times.append(float(text))
+        except ValueError as why:
+            raise Wrong(f"{path}, line {i + 2}: {why}; expected whole counts") from why
+    if not len(rows) or np.abs(counts).max() > 32768:
+        raise Wrong(f"{path}: no rows, or counts beyond 16 bits")
+    if rate is None and len(times) > 1 and times[-1] > times[0]:
+        rate = (len(times) - 1) / (times[-1] - times[0])
+    return Recording(path.name, counts, rate, lsb[accel_range], scale[gyro_range])
