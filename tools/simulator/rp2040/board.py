@@ -48,6 +48,7 @@ class Board:
         self._timed_out = False
         self._usb = USBCDC(self.mcu.usb_ctrl)
         self._held = emulator.HeldUSB(self.mcu)
+        self._pio = emulator.IdlePIO(self.mcu)
         self._usb.on_serial_data = self._heard
         self._usb.on_device_connected = self._is_connected
         self._reset = self.mcu.watchdog.on_watchdog_trigger
@@ -225,7 +226,9 @@ class Board:
         self.resets += 1
         self.connected = False
         self._held.forget()
+        self._pio.wake()  # to be reset
         self._reset()
+        self._pio.rest()
 
     # ------------------------------------------------------------------------------------ memory
 

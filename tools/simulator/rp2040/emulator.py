@@ -14,6 +14,7 @@ _I2C_BLOCKS = (0x40044, 0x40048)  # where they sit in the map of peripherals (ad
 # CLK_PERI_CTRL.AUXSRC (RP2040 datasheet 2.15.7): clk_sys, pll_sys, pll_usb
 _PERIPHERAL_HZ = {0: HZ, 1: HZ, 2: 48_000_000}
 _CLK_PERI_CTRL = 0x48
+_PIO_BLOCKS = (0x50200, 0x50300)
 _SSPCR0, _SSPCPSR = 0x000, 0x010
 _PACKET = 64  # bytes of a full-speed bulk packet
 
@@ -27,6 +28,35 @@ def run(simulator):
     simulator.stopped = False
     while not simulator.stopped:
         execute_batch(simulator, 1)
+
+
+class IdlePIO:
+    """No defect: both PIO blocks are asked after each instruction whether they run, which takes an eighth of all time.
+    So they are off the list until a program of the board writes to one of them.
+    """
+
+    def __init__(self, mcu: RP2040):
+        self._working = mcu.pio
+        self._blocks = list(mcu.pio)
+        for at, block in zip(_PIO_BLOCKS, self._blocks, strict=True):
+            mcu.peripherals[at] = _PIOBlock(self, block)
+        self.rest()
+
+    def rest(self):
+        self._working.clear()
+
+    def wake(self):
+        self._working[:] = self._blocks
+
+
+class _PIOBlock:
+    def __init__(self, idle, block):
+        self.read_uint32 = block.read_uint32
+        self._wake, self._write = idle.wake, block.write_uint32_atomic
+
+    def write_uint32_atomic(self, offset, value, atomic_type):
+        self._wake()
+        self._write(offset, value, atomic_type)
 
 
 class HeldUSB:
