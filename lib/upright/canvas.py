@@ -6,6 +6,11 @@ import sys
 import micropython
 from micropython import const
 
+try:
+    import framebuf
+except ImportError:
+    framebuf = None
+
 from upright.font import LARGE, SMALL, TALL, columns  # noqa: F401 (sizes are part of this module)
 
 # Colours. OPAQUE and INVERSE draw a character's whole cell, so that a number replaces the old one.
@@ -36,9 +41,7 @@ def _fill(fb, stride: int, height: int, x: int, y: int, w: int, h: int, colour: 
     page = y >> 3
     while page << 3 < y1:
         top = page << 3
-        mask = 255
-        if top < y:
-            mask = 255 << (y - top)
+        mask = 255 << (y - top) if top < y else 255
         if top + 8 > y1:
             mask &= 255 >> (top + 8 - y1)
         # new = (old & keep) ^ flip
@@ -171,11 +174,9 @@ def _digits(out, value: int, drop: int, decimals: int, sign: int, width: int) ->
         unit *= 10
         drop -= 1
     v = (v + (unit >> 1)) // unit
-    mark = 0
+    mark = 43 if sign else 0
     if value < 0 and v > 0:
         mark = 45
-    elif sign:
-        mark = 43
     # backwards into the upper half, where there is room for any int
     i = 48
     places = 0
@@ -209,22 +210,20 @@ class Canvas:
     """A width x height frame buffer and what draws into it; everything is clipped at the edges.
 
     buffer: bytearray of width * height / 8, page after page of 8 rows, one byte a column, LSB on
-    top. Coordinates are pixels from the upper left corner, within +-8000, negative ones included.
+    top. framebuffer: a framebuf.FrameBuffer on the same bytes, or None where the port has none.
+    Coordinates are pixels from the upper left corner, within +-8000, negative ones included.
     """
 
     def __init__(self, width, height):
         self.width = width
         self.height = height
         self.buffer = bytearray(width * (height // 8))
+        # an attribute: with a property in its class, every store to an instance costs a search
+        self.framebuffer = None
+        if framebuf is not None:
+            self.framebuffer = framebuf.FrameBuffer(self.buffer, width, height, framebuf.MONO_VLSB)
         self._cols = bytearray(24)
         self._ascii = bytearray(48)
-
-    @property
-    def framebuffer(self):
-        """A new framebuf.FrameBuffer that draws into `buffer`; ImportError where a port has none."""
-        import framebuf
-
-        return framebuf.FrameBuffer(self.buffer, self.width, self.height, framebuf.MONO_VLSB)
 
     # native: default arguments without a frame on the heap, which bytecode takes beyond 11 words
 

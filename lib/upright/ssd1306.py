@@ -23,6 +23,8 @@ from upright.canvas import (  # noqa: F401 (colours and sizes are part of this m
 
 _BLOCK = const(8)  # columns of one page that are tracked and sent together
 _ATTEMPTS = const(8)  # failed transfers in a row after which a frame is given up
+_FIRST = const(1)  # of the set-up's pieces that flush_step() sends; 0 is for begin() alone
+_DONE = const(5)
 _MOST_ERRORS = const(0x1FFFFFFF)  # the counters stop here: beyond 30 bits an int would be boxed
 
 
@@ -129,7 +131,7 @@ class SSD1306(Canvas):
     I2C. dc, rst, cs: on SPI, output pins that can be called with 0 or 1; rst and cs are None where
     the module ties them. chunk: bytes that flush_step() sends at most, a multiple of 8 up to 128.
     rotate: 0 or 180. column_offset: the controller's column of the panel's left edge at rotate=0;
-    by default the panel sits in the middle of the controller's 128 (SH1106: 132) columns.
+    by default the panel is in the middle of the controller's 128 (SH1106: 132), 96x16 at column 0.
 
     Drawing goes into `buffer` at any time. show() compares it with `_sent`, what the display holds,
     and hands over the blocks of 8 columns that differ; flush_step() sends them in bounded chunks.
@@ -144,6 +146,8 @@ class SSD1306(Canvas):
 
     errors: failed transfers. dropped: frames given up. lost: the display did not answer last time.
     """
+
+    _dc = _rst = _cs = None  # on I2C
 
     def __init__(
         self,
@@ -194,9 +198,11 @@ class SSD1306(Canvas):
         self.lost = False
         self.errors = 0
         self.dropped = 0
-        self._dc = None if i2c else dc
-        self._rst = rst
-        self._cs = cs
+        self._write = self._write_i2c if i2c else self._write_spi
+        if not i2c:
+            self._dc = dc
+            self._rst = rst
+            self._cs = cs
         self._sent = bytearray(width * self.pages)
         self._dirty = array("H", [0] * self.pages)
         self._offset = spare - column_offset if rotate else column_offset
@@ -206,7 +212,6 @@ class SSD1306(Canvas):
         self._fails = 0
         self._everything = True
         self._resend = False
-        self._on = True
         # I2C sends a control byte first: 0x00 commands, 0x40 data (8.1.5.2); SPI leaves it out and
         # has the D/C pin
         first = 0 if i2c else 1
@@ -216,16 +221,9 @@ class SSD1306(Canvas):
         data = memoryview(self._tx)
         self._views = [data[first : 1 + n] for n in range(0, chunk + 1, _BLOCK)]
         self._head_view = memoryview(self._head)[first:]
-        # Power-up also stops scrolling (2E) or, on the SH1106, starts the pump (AD 8B, only while
-        # the display is off). E3 (no operation) first: it ends a command that was cut off before
-        # its parameter.
-        begin = b"\x00\xe3\xe3\xae\xad\x8b" if sh1106 else b"\x00\xe3\xe3\xae\x2e"
-        self._begin = memoryview(begin)[first:]
         pieces = self._commands(sh1106, rotate, contrast)
-        self._setup = [memoryview(piece)[first:] for piece in pieces]
-        self._state = pieces[-1]  # its bytes 2, 4 and 7 are contrast, inverse and power
-        self._pieces = len(pieces)
-        self._piece = self._pieces
+        self._setup = [memoryview(bytearray(piece))[first:] for piece in pieces]
+        self._piece = _DONE
 
     def _commands(self, sh1106, rotate, contrast):
         """The set-up (10.1) in pieces of at most 8 bytes, since the tick may send them, too."""
@@ -233,24 +231,23 @@ class SSD1306(Canvas):
         # without AD 30, the internal one of 30 uA (SSD1306B and SSD1315; others ignore it:
         # micropython/micropython#7411, rust-embedded-community/ssd1306#141).
         current = (0xE3, 0xE3) if sh1106 or self.width == 128 else (0xAD, 0x30)
+        pump = (0xE3, 0xE3) if sh1106 else (0x8D, 0x14)
         # 128x32 and 96x16 panels are wired sequentially, the others alternate (10.1.18)
         pins = 0x02 if self.width > 2 * self.height else 0x12
-        return [
-            bytearray(b"\x00" + bytes(piece))
-            for piece in (
-                # segment and COM order; multiplex ratio; current
-                (0xE3, 0xA0 if rotate else 0xA1, 0xC0 if rotate else 0xC8, 0xA8, self.height - 1)
-                + current,
-                # start line 0; offset 0; COM wiring; clock
-                (0x40, 0xD3, 0x00, 0xDA, pins, 0xD5, 0x50 if sh1106 else 0x80),
-                # pre-charge; VCOMH level; page addressing (the SH1106 has no other)
-                (0xD9, 0x22, 0xDB, 0x35) if sh1106 else (0xD9, 0xF1, 0xDB, 0x30, 0x20, 0x02),
-                # contrast; show the RAM; not inverted; charge pump (appendix: 8D 14, then AF)
-                (0x81, contrast & 255, 0xA4, 0xA6)
-                + ((0xE3, 0xE3) if sh1106 else (0x8D, 0x14))
-                + (0xAF,),
-            )
-        ]
+        order = (0xA0, 0xC0) if rotate else (0xA1, 0xC8)
+        # E3 (no operation) first: it ends a command that was cut off before its parameter
+        return (
+            # off; the SH1106's pump, which starts only while the display is off; no scrolling
+            (0x00, 0xE3, 0xE3, 0xAE) + ((0xAD, 0x8B) if sh1106 else (0x2E,)),
+            # segment and COM order; multiplex ratio; current
+            (0x00, 0xE3) + order + (0xA8, self.height - 1) + current,
+            # start line 0; offset 0; COM wiring; clock
+            (0x00, 0x40, 0xD3, 0x00, 0xDA, pins, 0xD5, 0x50 if sh1106 else 0x80),
+            # pre-charge; VCOMH level; page addressing (the SH1106 has no other)
+            (0x00, 0xD9) + ((0x22, 0xDB, 0x35) if sh1106 else (0xF1, 0xDB, 0x30, 0x20, 0x02)),
+            # show the RAM; charge pump (appendix: 8D 14, then AF); contrast; not inverted; on
+            (0x00, 0xA4) + pump + (0x81, contrast & 255, 0xA6, 0xAF),
+        )
 
     # -------------------------------------------------------------------------- set-up and state
 
@@ -269,17 +266,20 @@ class SSD1306(Canvas):
         self.busy = False
         self.lost = False
         try:
-            self._write(0, self._begin)
+            self._write(0, self._setup[0])
         except OSError:
             self.errors += 1
             self._absent()
         # the contents are undefined at power-up: write them before the light goes on
         self._everything = True
-        self._state[7] = 0xAE
+        last = self._setup[-1]
+        light = last[-1]
+        last[-1] = 0xAE
         try:
             self._finish()
         finally:
-            self.power(self._on)
+            last[-1] = light
+            self._resend = True
         self._finish()
 
     def _finish(self):
@@ -289,7 +289,7 @@ class SSD1306(Canvas):
 
     def _absent(self):
         self.lost = True
-        if self._dc is not None:
+        if not hasattr(self.bus, "writeto"):
             raise DisplayError("the SPI bus of the display failed: check its pins")
         text = "no display answers at 0x{:02X} (nor at 0x{:02X}): check VCC, GND, SDA and SCL"
         try:
@@ -301,18 +301,17 @@ class SSD1306(Canvas):
 
     def contrast(self, level):
         """Brightness 0..255; takes effect with the next show()."""
-        self._state[2] = level & 255
+        self._setup[-1][-3] = level & 255
         self._resend = True
 
     def invert(self, on):
         """Dark on light; takes effect with the next show()."""
-        self._state[4] = 0xA7 if on else 0xA6
+        self._setup[-1][-2] = 0xA7 if on else 0xA6
         self._resend = True
 
     def power(self, on):
         """Display on, or asleep with its contents kept; takes effect with the next show()."""
-        self._on = on
-        self._state[7] = 0xAF if on else 0xAE
+        self._setup[-1][-1] = 0xAF if on else 0xAE
         self._resend = True
 
     # -------------------------------------------------------------------------- sending
@@ -325,11 +324,11 @@ class SSD1306(Canvas):
         self._everything = False
         if everything or self._resend:
             self._resend = False
-            self._piece = 0
+            self._piece = _FIRST
         blocks = _changes(self.buffer, self._sent, self._dirty, self.width, self.pages, everything)
         if self._refresh:
             blocks += self._freshen()
-        self._left = (blocks + self._pieces - self._piece) * _BLOCK
+        self._left = (blocks + _DONE - self._piece) * _BLOCK
         # last of all: from here on the sender, perhaps an interrupt, owns _sent, _dirty and the bus
         self.busy = self._left > 0
         return True
@@ -365,7 +364,7 @@ class SSD1306(Canvas):
         if max_bytes < _BLOCK:
             return self._left
         try:
-            if self._piece < self._pieces:
+            if self._piece < _DONE:
                 self._write(0, self._setup[self._piece])
                 self._piece += 1
                 self._left -= _BLOCK
@@ -396,9 +395,9 @@ class SSD1306(Canvas):
         if self.errors < _MOST_ERRORS:
             self.errors += 1
         self._fails += 1
-        if self._piece < self._pieces:
-            self._left += self._piece * _BLOCK
-            self._piece = 0  # from the start: its no-operation ends a command that was cut in two
+        if self._piece < _DONE:
+            self._left += (self._piece - _FIRST) * _BLOCK
+            self._piece = _FIRST  # whose no-operation ends a command that was cut in two
         if self._fails < _ATTEMPTS and not self.lost:
             return self._left
         if self.dropped < _MOST_ERRORS:
@@ -414,10 +413,10 @@ class SSD1306(Canvas):
             pass
         return not self.lost
 
-    def _write(self, data, view):
-        if self._dc is None:
-            self.bus.writeto(self.address, view)
-            return
+    def _write_i2c(self, data, view):
+        self.bus.writeto(self.address, view)
+
+    def _write_spi(self, data, view):
         self._dc(data)
         if self._cs is None:
             self.bus.write(view)
