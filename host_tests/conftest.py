@@ -28,12 +28,58 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("upright")
 
 
+# The recorded trials that tests hold to figures; others in the folder change nothing.
+TRIALS = (
+    "broad_02_undisturbed_slow_rotation_B",
+    "broad_07_undisturbed_fast_rotation_B",
+    "broad_15_undisturbed_fast_translation_A",
+    "broad_24_disturbed_tapping_A",
+    "broad_28_disturbed_stationary_magnet_A",
+    "broad_34_disturbed_attached_magnet_3cm",
+    "mpu6050_static_655s",
+    "tyrex_nexus5_Thibaud_NoDist_Texting",
+)
+
+
+def recorded_trials(beginning=""):
+    """Those of TRIALS that are there, as paths; of these, whose name begins so."""
+    return [
+        path
+        for path in trials.trial_files()
+        if path.stem in TRIALS and path.stem.startswith(beginning)
+    ]
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--runtimes", help="only these, as in cpython,unix32; tests of the others skip"
+    )
+
+
+def pytest_configure(config):
+    chosen = config.getoption("--runtimes")
+    if chosen:
+        unknown = set(chosen.split(",")) - set(runtimes.LISTED)
+        if unknown:
+            raise pytest.UsageError(f"--runtimes: unknown {', '.join(sorted(unknown))}")
+        for name in set(runtimes.LISTED) - set(chosen.split(",")):
+            runtimes.leave_out(name, "left out by --runtimes")
+
+
 def pytest_generate_tests(metafunc):
-    """`recorded`: each recorded trial in turn, as a path; one skip, in one clear line, where there are none."""
+    """`recorded`: each of TRIALS in turn, as a path; one that is not there is one skip, in one clear line."""
     if "recorded" in metafunc.fixturenames:
-        files = [pytest.param(path, id=path.stem) for path in trials.trial_files()]
-        none = pytest.param(None, id="none", marks=pytest.mark.skip(reason=trials.NO_DATA))
-        metafunc.parametrize("recorded", files or [none])
+        there = {path.stem: path for path in recorded_trials()}
+        if there:
+            why, names = "this recorded trial is not in the folder", TRIALS
+        else:
+            why, names = trials.NO_DATA, ("none",)
+        absent = pytest.mark.skip(reason=why)
+        params = [
+            pytest.param(there.get(name), id=name, marks=() if name in there else absent)
+            for name in names
+        ]
+        metafunc.parametrize("recorded", params)
 
 
 def pytest_collection_modifyitems(items):
@@ -58,6 +104,12 @@ def require(name: str) -> str:
     except runtimes.Unavailable as why:
         pytest.skip(f"runtime {name}: {why}")
     return name
+
+
+def some_micropython() -> str:
+    """The quickest MicroPython that is at hand."""
+    name = simulate.best_runtime()
+    return require("unix") if name == "cpython" else name
 
 
 @pytest.fixture(params=runtimes.NAMES)

@@ -18,7 +18,8 @@ from reference.mahony_float import angle_between
 from upright import complementary, euler_kernels
 from upright.complementary import Euler6
 from upright.mahony import Mahony6
-from upright_host import runtimes, scoring, trials
+from upright_host import scoring, trials
+from upright_host.simulate import best_runtime as quickest
 
 ONE = 1 << 29
 TURN = 1 << 30
@@ -53,15 +54,6 @@ def turned(angle):
 def run(filter, row, n):
     for _ in range(n):
         filter.update(row)
-
-
-def quickest():
-    """The runtime for long runs."""
-    try:
-        runtimes.interpreter("unix")
-        return "unix"
-    except runtimes.Unavailable:
-        return "cpython"
 
 
 @pytest.fixture

@@ -11,11 +11,13 @@ import motions
 import numpy as np
 import overflow
 import pytest
+from conftest import recorded_trials
 from reference import inertial_float
 from upright import fixmath
 from upright import inertial_kernels as kernels
 from upright.inertial import Inertial6, Inertial9, Inertial9Lite, InertialMahony
 from upright_host import runtimes, scoring, trials
+from upright_host.simulate import best_runtime as quickest
 
 LIB = runtimes.paths.PACKAGE
 ONE = 1 << 29
@@ -25,15 +27,6 @@ APART_DEG = 0.1
 TOTAL_APART_DEG = 0.05
 # (rate, every so many samples with a fresh magnetometer)
 PACES = [(90, 1), (200, 3), (500, 10)]
-
-
-def quickest():
-    """The runtime for long runs."""
-    try:
-        runtimes.interpreter("unix")
-        return "unix"
-    except runtimes.Unavailable:
-        return "cpython"
 
 
 class History:
@@ -137,7 +130,7 @@ def test_recorded_trials_as_the_float_twin_and_as_accurate_as_promised(history, 
 
 
 def test_the_mean_of_the_recorded_benchmark_trials(history):
-    files = [file for file in trials.trial_files() if file.stem.startswith("broad_")]
+    files = recorded_trials("broad_")
     if len(files) < 6 or quickest() == "cpython":
         pytest.skip("needs the BROAD trials and the unix runtime")
     scores = []
@@ -152,7 +145,7 @@ def test_the_mean_of_the_recorded_benchmark_trials(history):
 
 
 def test_six_axes_on_the_static_trial_hold_their_heading(history):
-    files = [file for file in trials.trial_files() if file.stem.startswith("mpu6050_static")]
+    files = recorded_trials("mpu6050_static")
     if not files or quickest() == "cpython":
         pytest.skip("needs the static trial and the unix runtime")
     trial = trials.load(files[0])

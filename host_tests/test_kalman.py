@@ -18,7 +18,8 @@ from reference.mahony_float import angle_between
 from upright import complementary, kalman
 from upright.complementary import Euler6
 from upright.kalman import Kalman6, KalmanFilter
-from upright_host import runtimes, trials
+from upright_host import trials
+from upright_host.simulate import best_runtime as quickest
 
 ONE = 1 << 29
 TURN = 1 << 30
@@ -355,15 +356,6 @@ def history(portable, tmp_path):
         return q
 
     return go
-
-
-def quickest():
-    """The runtime for long runs."""
-    try:
-        runtimes.interpreter("unix")
-        return "unix"
-    except runtimes.Unavailable:
-        return "cpython"
 
 
 def filter_and_rows(rendered, bias=(), **gains):

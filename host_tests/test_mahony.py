@@ -14,6 +14,7 @@ from reference.mahony_float import MahonyFloat
 from upright import fixmath, mahony
 from upright.mahony import Mahony6
 from upright_host import runtimes, trials
+from upright_host.simulate import best_runtime as quickest
 
 ONE = 1 << 29
 SCALE = (82, 5)
@@ -63,15 +64,6 @@ def history(portable, tmp_path):
         return q
 
     return run
-
-
-def quickest():
-    """The runtime for long runs."""
-    try:
-        runtimes.interpreter("unix")
-        return "unix"
-    except runtimes.Unavailable:
-        return "cpython"
 
 
 # -- accuracy; pytest -rP shows the figures

@@ -8,7 +8,7 @@ import subprocess
 import threading
 
 import pytest
-from conftest import require
+from conftest import some_micropython
 from unix_board import UnixBoard
 from upright_host import __version__, packages, paths, runtimes
 
@@ -33,11 +33,10 @@ def test_every_module_is_in_a_package_and_every_version_is_the_projects():
 
 @pytest.mark.parametrize("name", packages.names())
 def test_a_package_can_be_imported_with_nothing_else_there(name, tmp_path):
-    require("unix")
+    start, _ = runtimes.interpreter(some_micropython())
     for module in packages.modules(name):
         (tmp_path / "upright").mkdir(exist_ok=True)
         shutil.copy(paths.PACKAGE / f"{module}.py", tmp_path / "upright")
-    start, _ = runtimes.interpreter("unix")
     for module in packages.modules(name):
         done = subprocess.run(
             [*start, "-c", f"import upright.{module}"],
@@ -71,7 +70,7 @@ def index(tmp_path):
 def test_mpremotes_mip_installs_from_the_index(index, tmp_path, mpy):
     from mpremote import mip
 
-    require("unix")
+    some_micropython()
     flash = tmp_path / "flash"
     flash.mkdir()
     board = UnixBoard(flash)
@@ -89,7 +88,7 @@ def test_mpremotes_mip_installs_from_the_index(index, tmp_path, mpy):
 def test_mip_installs_a_package_file_of_a_clone(tmp_path):
     from mpremote import mip
 
-    require("unix")
+    some_micropython()
     board = UnixBoard(tmp_path)
     try:
         mip._install_package(board, str(paths.PACKAGE / "calibration.json"), "", "lib", None, True)

@@ -11,6 +11,7 @@ import motions
 import numpy as np
 import overflow
 import pytest
+from conftest import recorded_trials
 from reference import quaternion_kalman_float
 from reference.inertial_float import start
 from test_inertial import all_axes, angles_between, as_start, errors, pushes, quickest, scene
@@ -131,7 +132,7 @@ def test_recorded_trials_as_the_float_twin(history, recorded):
 
 
 def test_recorded_trials_as_accurate_as_promised(history):
-    files = trials.trial_files()
+    files = recorded_trials()
     if not files or quickest() == "cpython":
         pytest.skip("needs recorded trials and the unix runtime")
     nine, six = [], []

@@ -5,7 +5,7 @@ import json
 import subprocess
 
 from mpremote.transport import Transport, TransportExecError
-from upright_host import runtimes
+from upright_host import runtimes, simulate
 
 # Runs a line of JSON (the code) in one namespace; the answer: a line of JSON [output, error or null]
 _SERVER = """
@@ -40,7 +40,7 @@ class UnixBoard(Transport):
     def __init__(self, folder, actions_left=None):
         self.actions_left = actions_left
         self.actions = 0
-        start, _ = runtimes.interpreter("unix")
+        start, _ = runtimes.interpreter(simulate.best_runtime())
         self._process = subprocess.Popen(
             [*start, "-c", _SERVER],
             cwd=folder,

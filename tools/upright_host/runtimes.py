@@ -158,12 +158,17 @@ def _unpacked_command(name: str) -> list[str]:
     return [qemu, "-L", str(root), binary]
 
 
+def leave_out(name: str, why: str) -> None:
+    """As if this machine could not have a runtime."""
+    _ready[name] = Unavailable(why)
+
+
 def interpreter(name: str) -> tuple[list[str], str]:
     """-> (command that starts this runtime, its version). It is obtained first where that is needed.
 
     Raises Unavailable with the reason, in one line, where this machine cannot have it.
     """
-    if name == "cpython":
+    if name == "cpython" and name not in _ready:
         return [sys.executable], platform.python_version()
     if name not in _ready:
         try:

@@ -20,11 +20,13 @@ class SimulationError(Failed):
 
 def best_runtime() -> str:
     """The quickest runtime that checks for allocation, else cpython."""
-    try:
-        runtimes.interpreter("unix")
-        return "unix"
-    except runtimes.Unavailable:
-        return "cpython"
+    for name in ("unix", "unix32"):
+        try:
+            runtimes.interpreter(name)
+            return name
+        except runtimes.Unavailable:
+            pass
+    return "cpython"
 
 
 def run(runtime: str, script: Path, config: dict, on_event=None, flash: Path | None = None) -> dict:
