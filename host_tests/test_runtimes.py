@@ -1,9 +1,13 @@
 """The runtimes: what is obtained, what is said where it cannot be had, and that an interruption does no harm."""
 
+import json
 import platform
+import re
+import shutil
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 from upright_host import cli, console, debian, paths, runtimes
@@ -96,6 +100,76 @@ def test_exec_runs_a_file_and_passes_its_status_on(tmp_path):
     done = subprocess.run([*upright, tmp_path / "absent.py"], capture_output=True, text=True)
     assert done.returncode == 2
     assert "does not exist" in done.stderr
+
+
+def readme_program():
+    """The program of README's "Use one module alone", and the files that its packages list."""
+    section = (paths.ROOT / "README.md").read_text().split("## Use one module alone")[1]
+    needs, program = section.split("```python\n")[:2]
+    packages = re.findall(r"\blib/upright/\w+\.json", needs)
+    urls = [
+        pair for name in packages for pair in json.loads((paths.ROOT / name).read_text())["urls"]
+    ]
+    return program.split("```")[0], {target: paths.PACKAGE / source for target, source in urls}
+
+
+def test_the_readmes_program_runs_from_the_files_of_its_packages_alone(runtime, tmp_path):
+    program, files = readme_program()
+    assert len(files) > 4
+    for target, source in files.items():
+        (tmp_path / "lib" / target).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(source, tmp_path / "lib" / target)
+    (tmp_path / "program.py").write_text(program)
+    argv, environment = runtimes.program(
+        runtime, tmp_path / "program.py", seconds=2, folders=[tmp_path / "lib"]
+    )
+    done = subprocess.run(argv, env=environment, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (0, "")
+    angles = np.array([line.split() for line in done.stdout.splitlines()], int)
+    assert 300 < len(angles) < 400  # at 200 Hz, from when the sensor is awake
+    assert 0 < abs(angles[:, :2]).max() < 500  # level but for the sensor's noise
+
+
+def test_a_program_has_the_chips_of_its_board_and_simulated_time(runtime, tmp_path):
+    script = tmp_path / "program.py"
+    script.write_text(
+        "import sys, time, utime\n"
+        "from machine import I2C, Pin, SoftI2C\n"
+        "begin = utime.ticks_ms()\n"
+        "time.sleep(1)\n"
+        "utime.sleep_ms(500)\n"
+        "time.sleep_us(1000)\n"
+        "print(time.ticks_diff(time.ticks_ms(), begin), utime.ticks_diff(utime.ticks_ms(), begin))\n"
+        "print(I2C(0, scl=Pin(5), sda=Pin(4)).scan(), SoftI2C(scl=Pin(5), sda=Pin(4)).scan())\n"
+        "print(__name__, sys.argv[1:])\n"
+        "sys.exit(7)\n"
+    )
+    argv, environment = runtimes.program(runtime, script, ["a", "-b"])
+    done = subprocess.run(argv, env=environment, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (7, "")
+    assert done.stdout.splitlines() == [
+        "1501 1501",
+        "[60, 104] [60, 104]",
+        "__main__ ['a', '-b']",
+    ]
+
+
+def test_a_program_that_only_prints_comes_to_its_end(tmp_path):
+    script = tmp_path / "program.py"
+    script.write_text("while True:\n    print('x' * 99)\n")
+    done = CliRunner().invoke(
+        cli.app, ["exec", "--runtime", "cpython", "--seconds", "0.1", str(script)]
+    )
+    assert done.exit_code == 0
+
+
+@pytest.mark.parametrize("board", [name for name in paths.boards() if name != "robomaster_a"])
+def test_every_board_has_its_sensor_and_display_on_its_pins(board, tmp_path):
+    script = tmp_path / "program.py"
+    script.write_text("import board\nprint(board.sensor().read(), board.display(32) is not None)\n")
+    argv, environment = runtimes.program("cpython", script, board=board)
+    done = subprocess.run(argv, env=environment, capture_output=True, text=True, timeout=60)
+    assert done.stdout == "0 True\n", done.stderr  # asleep
 
 
 def test_exec_says_why_a_runtime_cannot_be_had(tmp_path):
