@@ -117,15 +117,13 @@ class Apt:
                 subprocess.run(["dpkg-deb", "-x", deb, root], check=True, capture_output=True)
 
 
-def source(
-    package: str, suite: str, into: Path, step=lambda percent, text: None, patched: bool = False
-) -> Path:
+def source(package: str, suite: str, into: Path, step=lambda percent, text: None) -> Path:
     """Fetch a source package (name, or name=version) of a suite and unpack it -> into, an absolute path.
 
     Where `into` exists it is the answer: nothing is fetched twice, and what is left of an interrupted run is not taken
     for the whole. apt checks signature and hashes. dpkg-source is not needed: the folder holds what upstream released
-    (as Debian repacked it), in debian/ what Debian adds, and Debian's patches are applied only where patched is True
-    (that needs the program patch). step(percent, text) tells how far it is. Raises AptError, one line.
+    (as Debian repacked it), in debian/ what Debian adds, no patch applied. step(percent, text) tells how
+    far it is. Raises AptError, one line.
     """
     into = into.absolute()
     into.parent.mkdir(parents=True, exist_ok=True)
@@ -145,8 +143,6 @@ def source(
             apt.download([package], step, ("source", "--only-source", "--download-only"))
             step(100, f"unpacking {package}")
             tree = _unpack_source(apt.folder / "debs")
-            if patched:
-                _patch(tree)
             tree.rename(into)
     return into
 
@@ -182,23 +178,3 @@ def _unpack_source(folder: Path) -> Path:
         with contextlib.suppress(FileNotFoundError):
             shutil.rmtree(scratch)
     return tree
-
-
-def _patch(tree: Path) -> None:
-    if not shutil.which("patch"):
-        raise AptError("patch is not here; install Debian's package patch")
-    series = tree / "debian/patches/series"
-    for line in series.read_text().splitlines() if series.exists() else []:
-        name = line.split("#")[0].strip()
-        if not name:
-            continue
-        done = subprocess.run(
-            ["patch", "-p1", "-s", "-f", "-i", series.parent / name.split()[0]],
-            cwd=tree,
-            capture_output=True,
-            text=True,
-        )
-        if done.returncode:
-            raise AptError(
-                f"Debian's {name} does not apply: {done.stdout.strip().splitlines()[:1]}"
-            )

@@ -286,7 +286,7 @@ def register(app: typer.Typer) -> None:
             help="Run it with each of these filters, a,b,... and compare (default: the board's).",
         ),
         headless: bool = typer.Option(
-            False, help="No live display: progress, the last picture, the figures."
+            False, "--headless", help="No live display: progress, the last picture, the figures."
         ),
         seconds: float = options.seconds("Simulated time (25; of a trial, all of it)."),
         speed: float = typer.Option(None, min=0, help="Times real time; 0: as fast as it goes."),

@@ -152,7 +152,7 @@ def register(app: typer.Typer) -> None:
         ),
         ki: float = typer.Option(None, help="Their integral gain, rad/s^2 (0)."),
         direct: bool = typer.Option(
-            False, help="Counts straight into the filter, past chip and driver."
+            False, "--direct", help="Counts straight into the filter, past chip and driver."
         ),
     ):
         """Replay a trial through the simulated chip's registers, the driver, the tick and a filter; score it."""

@@ -455,7 +455,10 @@ def register(app: typer.Typer) -> None:
     def score(
         where: list[Path] = typer.Argument(..., help="Folders of trials (.npz), or trials."),
         filters: str = typer.Option(
-            FILTERS, help="Filters, with commas between; baselines may be among them."
+            FILTERS,
+            show_default=False,
+            help="Filters, with commas between; baselines may be among them (default: "
+            f"{FILTERS.replace(',', ', ')}).",
         ),
         runtime: str = options.runtime(),
         baselines: bool = BASELINES_OPTION,
