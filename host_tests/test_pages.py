@@ -61,6 +61,12 @@ def bench():
     return chip, display, pages.Pages(display)
 
 
+@pytest.mark.parametrize("panel", ["SSD1306 72x40", "SSD1306 64x32", "SSD1306 128x16"])
+def test_a_panel_that_the_pages_do_not_fit_is_refused(panel):
+    with pytest.raises(ValueError, match=f"128x64 or 128x32 pixels, not {panel.split()[1]}"):
+        pages.Pages(ssd1306.SSD1306(machine.I2C(0), panel))
+
+
 def draw(bench, page, angles, rate=200, temperature=2500, faults=0, flags=0):
     _chip, display, book = bench
     book.draw(page, array("i", angles), rate, temperature, faults, flags)

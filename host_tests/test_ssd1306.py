@@ -1,5 +1,6 @@
 """The OLED driver: drawing against a naive reference, numbers against Python's, and the way to the glass."""
 
+import re
 import sys
 from decimal import ROUND_HALF_UP, Decimal
 
@@ -11,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from upright import ssd1306
 from upright.ssd1306 import BLACK, INVERSE, LARGE, OPAQUE, SMALL, TALL, WHITE, XOR
-from upright_host import oled
+from upright_host import oled, paths
 
 QUICK = settings(max_examples=150, deadline=None)
 COLOURS = st.sampled_from((BLACK, WHITE, XOR))
@@ -451,6 +452,18 @@ def test_a_display_that_appears_later_is_set_up_by_itself():
     chip.come_back()
     assert d.show() and d.flush()
     assert chip.lit and chip.picture() == rows(d) and not d.lost
+
+
+def test_the_example_of_the_documents_shows_its_number():
+    chip = SSD1306Chip()
+    machine.wire_i2c(0, chip)
+    (code,) = re.findall(r"```python\n(.*?)```", (paths.ROOT / "docs/display.md").read_text(), re.S)
+    names = {}
+    exec(code, names)
+    d = canvas()
+    d.text("hello", 0, 0)
+    d.text(" -123.5", 0, 16, LARGE)
+    assert chip.frame() == d.buffer == names["display"].buffer
 
 
 # ---------------------------------------------------------------- contrast, inverse, power

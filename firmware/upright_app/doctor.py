@@ -294,7 +294,7 @@ def _report_display(board, settings, problems):
         if display is not None:
             display.begin()
         print("display: %s" % ("none" if display is None else "written to"))
-    except OSError as why:
+    except (OSError, ValueError) as why:
         problems.append("display: %s. The firmware runs without it" % why)
 
 

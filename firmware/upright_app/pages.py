@@ -1,5 +1,5 @@
 # What the OLED shows: numbers, an artificial horizon, a status line below both, and messages. Needs
-# a display of lib/ssd1306.py, 128x64 or 128x32; runs in the main loop on every runtime. draw()
+# a display of upright.ssd1306, 128x64 or 128x32; runs in the main loop on every runtime. draw()
 # allocates nothing and takes integers only; message() is for start-up and may allocate.
 
 from array import array
@@ -97,6 +97,9 @@ class Pages:
     """
 
     def __init__(self, display, nose_up_positive=False):
+        if display.width != 128 or display.height not in (32, 64):
+            size = (display.width, display.height)
+            raise ValueError("the firmware's pages need 128x64 or 128x32 pixels, not %dx%d" % size)
         self._display = display
         self._low = display.height < 64
         self._nose_sign = 1 if nose_up_positive else -1
