@@ -125,6 +125,18 @@ def micropython_runtime(request):
 
 
 @pytest.fixture
+def upright():
+    """upright(*arguments) -> the result of the command line, with exit_code, output, stdout and stderr."""
+    from typer.testing import CliRunner
+    from upright_host import cli
+
+    def run(*arguments):
+        return CliRunner().invoke(cli.app, [str(a) for a in arguments])
+
+    return run
+
+
+@pytest.fixture
 def portable():
     """run(runtime, script, *args) -> what a script of host_tests/portable printed; its failure fails the test."""
 

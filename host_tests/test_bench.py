@@ -7,7 +7,7 @@ import pytest
 from conftest import require
 from upright.fixmath import euler
 from upright.mahony import Mahony6, Mahony9
-from upright_host import bench, console, tracing
+from upright_host import bench, tracing
 
 
 def log(*lines):
@@ -166,13 +166,8 @@ def test_figures_are_put_between_their_marks_and_nothing_else_changes(tmp_path):
 
 
 @pytest.mark.parametrize(("ratio", "code"), [(9.9, 1), (10.1, 0)])
-def test_the_command_fails_below_the_ratio_asked_for(monkeypatch, ratio, code):
-    import typer
-    from typer.testing import CliRunner
-
+def test_the_command_fails_below_the_ratio_asked_for(upright, monkeypatch, ratio, code):
     monkeypatch.setattr(bench, "measure", lambda: figures(ratio))
-    app = typer.Typer(cls=console.Commands)
-    bench.register(app)
-    done = CliRunner().invoke(app, [])
+    done = upright("bench")
     assert done.exit_code == code, done.output
     assert f"{ratio} times fewer" in done.output

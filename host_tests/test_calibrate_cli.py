@@ -10,14 +10,12 @@ import kernel
 import machine
 import numpy as np
 import pytest
-import typer
 import world
 from chips.mpu6050 import MPU6050Chip
-from typer.testing import CliRunner
 from upright import calibration
 from upright.mpu6050 import MPU6050
 from upright_app import record
-from upright_host import calibrate, console, mag_fit, paths, recordings, rest_fit
+from upright_host import mag_fit, paths, recordings, rest_fit
 
 import boards
 
@@ -30,16 +28,9 @@ SOFT = np.array([[1.08, 0.05, -0.02], [0.05, 0.94, 0.03], [-0.02, 0.03, 1.01]])
 
 
 @pytest.fixture
-def run():
+def run(upright):
     """run(*arguments) -> the result of `upright calibrate ...`, with exit_code and output."""
-    app = typer.Typer(cls=console.Commands)
-    app.callback()(lambda: None)
-    calibrate.register(app)
-
-    def invoke(*arguments):
-        return CliRunner().invoke(app, ["calibrate", *map(str, arguments)])
-
-    return invoke
+    return lambda *arguments: upright("calibrate", *arguments)
 
 
 @pytest.fixture

@@ -2,52 +2,16 @@
 
 import re
 
-import motions
 import numpy as np
 import pytest
 from PIL import Image
-from typer.testing import CliRunner
-from upright_host import cli, replay, runtimes, scoring, simulate
-
-
-@pytest.fixture
-def upright():
-    """upright(*arguments) -> the result, with exit_code and output."""
-
-    def run(*arguments):
-        return CliRunner().invoke(cli.app, [str(a) for a in arguments])
-
-    return run
+from trial_files import save
+from upright_host import replay, runtimes, scoring, simulate
 
 
 @pytest.fixture(scope="module")
 def trial(tmp_path_factory):
-    """A small .npz of a synthetic motion in the form of a recorded trial."""
-    import json
-
-    motion = motions.render("hand", rate=(200, 1), seconds=8, rest_seconds=2)
-    w, x, y, z = motion.q_true[::4].T
-    s = np.sqrt(0.5)  # x north, y west -> x east, y north: a quarter turn about up
-    enu = np.stack([s * w - s * z, s * x - s * y, s * y + s * x, s * z + s * w], 1)
-    header = {
-        "name": "synthetic",
-        "rate_hz": 200.0,
-        "gt_every": 4,
-        "gyr_dps_per_lsb": 5 / 82,
-        "acc_mps2_per_lsb": 9.80665 / 4096,
-        "mag_uT_per_lsb": 0.3,
-    }
-    path = tmp_path_factory.mktemp("trial") / "synthetic.npz"
-    np.savez_compressed(
-        path,
-        acc=motion.counts[:, :3],
-        gyr=motion.counts[:, 3:6],
-        mag=motion.counts[:, 6:9],
-        q_gt=enu.astype("f4"),
-        movement=np.packbits(np.ones(len(enu), bool)),
-        header=np.frombuffer(json.dumps(header).encode(), "u1"),
-    )
-    return path
+    return save(tmp_path_factory.mktemp("trial") / "synthetic.npz", rate=200, seconds=8)
 
 
 def test_demo_shows_the_display_the_error_and_the_ticks(upright, tmp_path):

@@ -1,7 +1,6 @@
 """`upright compare`: its figures are score's, its costs are counted, its pictures show what they say."""
 
 import csv
-import json
 import math
 import shutil
 import sys
@@ -9,12 +8,10 @@ import sys
 import motions
 import numpy as np
 import pytest
-import typer
 from conftest import require
-from typer.testing import CliRunner
+from trial_files import save
 from upright_host import (
     compare,
-    console,
     filter_costs,
     paths,
     plotting,
@@ -27,7 +24,6 @@ from upright_host import (
 )
 from upright_host.registry import filters as known_filters
 
-EVERY = 4
 # as a start 90 deg off comes down to 2 deg: tan(e / 2) falls with exp(-kp t)
 MAHONY_SETTLES = math.log(math.tan(math.radians(45)) / math.tan(math.radians(1))) / 0.5
 
@@ -58,46 +54,13 @@ class Broken(Mahony6):
 '''
 
 
-def save(path, motion="hand", rate=100, seconds=4.0, without=(), unknown_s=0, **header):
-    """A trial of a synthetic motion, as recorded ones are kept; its truth counts from 1 s on."""
-    made = motions.render(motion, rate=(rate, 1), seconds=seconds)
-    east_north = scoring._multiply(np.array([[1, 0, 0, 1]]) * math.sqrt(0.5), made.q_true)
-    q_gt = east_north[::EVERY]
-    q_gt[: -(-unknown_s * rate // EVERY)] = math.nan
-    num, den = made.gyro_scale
-    header = {
-        "name": path.stem,
-        "rate_hz": rate,
-        "gt_every": EVERY,
-        "gyr_dps_per_lsb": den / num,
-        "acc_mps2_per_lsb": trials.STANDARD_GRAVITY / made.accel_lsb_per_g,
-        "mag_uT_per_lsb": motions.MAG_UT_PER_LSB,
-    } | header
-    arrays = {
-        "acc": made.counts[:, 0:3],
-        "gyr": made.counts[:, 3:6],
-        "mag": made.counts[:, 6:9],
-        "q_gt": q_gt.astype("f4"),
-        "movement": np.packbits(np.arange(len(q_gt)) * EVERY >= rate),
-        "header": np.frombuffer(json.dumps(header).encode(), np.uint8),
-    }
-    np.savez(path, **{name: array for name, array in arrays.items() if name not in without})
-    return path
-
-
 @pytest.fixture
-def run():
+def run(upright):
     """run(*arguments) -> what `upright compare ARGUMENTS --runtime cpython` said, with exit_code."""
-    app = typer.Typer(cls=console.Commands)
-    app.callback()(lambda: None)
-    compare.register(app)
-    score.register(app)
 
     def run(*arguments, command="compare", runtime="cpython", costs=False):
-        arguments = [command, *map(str, arguments), "--runtime", runtime]
-        if command == "compare" and not costs:
-            arguments.append("--no-costs")
-        return CliRunner().invoke(app, arguments)
+        more = ["--no-costs"] if command == "compare" and not costs else []
+        return upright(command, *arguments, "--runtime", runtime, *more)
 
     return run
 

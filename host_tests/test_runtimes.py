@@ -9,8 +9,7 @@ import sys
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
-from upright_host import cli, console, debian, paths, runtimes
+from upright_host import console, debian, paths, runtimes
 
 
 @pytest.fixture
@@ -83,8 +82,8 @@ def test_an_old_micropython_on_path_is_not_taken(monkeypatch, tmp_path):
         runtimes._check([str(old)])
 
 
-def test_the_command_lists_every_runtime_with_a_version_or_a_reason():
-    done = CliRunner().invoke(cli.app, ["runtimes"])
+def test_the_command_lists_every_runtime_with_a_version_or_a_reason(upright):
+    done = upright("runtimes")
     assert done.exit_code == 0
     for name in runtimes.NAMES:
         assert name in done.stdout
@@ -154,12 +153,10 @@ def test_a_program_has_the_chips_of_its_board_and_simulated_time(runtime, tmp_pa
     ]
 
 
-def test_a_program_that_only_prints_comes_to_its_end(tmp_path):
+def test_a_program_that_only_prints_comes_to_its_end(upright, tmp_path):
     script = tmp_path / "program.py"
     script.write_text("while True:\n    print('x' * 99)\n")
-    done = CliRunner().invoke(
-        cli.app, ["exec", "--runtime", "cpython", "--seconds", "0.1", str(script)]
-    )
+    done = upright("exec", "--runtime", "cpython", "--seconds", "0.1", script)
     assert done.exit_code == 0
 
 
@@ -172,10 +169,10 @@ def test_every_board_has_its_sensor_and_display_on_its_pins(board, tmp_path):
     assert done.stdout == "0 True\n", done.stderr  # asleep
 
 
-def test_exec_says_why_a_runtime_cannot_be_had(tmp_path):
+def test_exec_refuses_an_unknown_runtime(upright, tmp_path):
     script = tmp_path / "script.py"
     script.write_text("")
-    done = CliRunner().invoke(cli.app, ["exec", "--runtime", "z80", str(script)])
+    done = upright("exec", "--runtime", "z80", script)
     assert done.exit_code == 2
     assert "unknown runtime" in done.stderr
 

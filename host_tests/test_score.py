@@ -7,8 +7,6 @@ import sys
 
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
 from upright_host import baselines, console, score, scoring, trials
 
 RATE, SECONDS, EVERY = 100, 3, 4
@@ -59,17 +57,9 @@ def save(path, off_deg=0.0, gyro=(0, 0, 0), rate=RATE, seconds=SECONDS, **header
 
 
 @pytest.fixture
-def run(tmp_path):
+def run(upright):
     """run(*arguments) -> what `upright score ARGUMENTS --runtime cpython` said, with exit_code."""
-    app = typer.Typer(cls=console.Commands)
-    app.callback()(lambda: None)
-    score.register(app)
-
-    def run(*arguments):
-        arguments = [str(argument) for argument in arguments]
-        return CliRunner().invoke(app, ["score", *arguments, "--runtime", "cpython"])
-
-    return run
+    return lambda *arguments: upright("score", *arguments, "--runtime", "cpython")
 
 
 @pytest.fixture

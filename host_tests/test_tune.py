@@ -6,10 +6,9 @@ import sys
 
 import numpy as np
 import pytest
-import typer
-from test_compare import figures, line_of, save  # noqa: F401 (figures: a fixture)
-from typer.testing import CliRunner
-from upright_host import console, kalman_scan, plotting, trials, tune
+from test_compare import figures, line_of  # noqa: F401 (figures: a fixture)
+from trial_files import save
+from upright_host import kalman_scan, plotting, trials, tune
 
 HZ = 100.0
 
@@ -32,15 +31,8 @@ def walk(ratio, n=12000, noise=2.0, seed=1):
 
 
 @pytest.fixture
-def run():
-    app = typer.Typer(cls=console.Commands)
-    app.callback()(lambda: None)
-    tune.register(app)
-
-    def run(*arguments):
-        return CliRunner().invoke(app, ["tune", "kalman", *map(str, arguments)])
-
-    return run
+def run(upright):
+    return lambda *arguments: upright("tune", "kalman", *arguments)
 
 
 # -- what a pair comes to
