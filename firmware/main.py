@@ -1,4 +1,6 @@
-# Runs after boot.py: the application on this board (board.py says which board it is).
+# Starts the application on this board (board.py says which board it is).
+
+import upright  # noqa: F401, I001  first: it finishes an installation that was cut off
 
 import board
 from upright_app import app

@@ -1,5 +1,5 @@
 """A board for tests of what the host does to one: MicroPython's unix port in a folder that is its file system, driven
-through mpremote's interface, and able to lose power before any of its actions."""
+through mpremote's interface, and able to lose power before any of its commands and any change of its file system."""
 
 import json
 import subprocess
@@ -7,9 +7,54 @@ import subprocess
 from mpremote.transport import Transport, TransportExecError
 from upright_host import runtimes, simulate
 
+POWER_CUT, SOFT_RESET = 9, 8  # what the process ends with
+
+# `os` of a board on FAT, where a rename over a file is two steps; `left` steps, then the power fails. None: never.
+_OS = """
+import os as _os, sys
+left, free = %r, %r
+def spend():
+    global left
+    if left is not None:
+        if not left:
+            sys.exit(9)
+        left -= 1
+class Os:
+    def __getattr__(self, name):
+        return getattr(_os, name)
+    def there(self, name):
+        try:
+            return _os.stat(name)
+        except OSError:
+            return None
+    def rename(self, old, new):
+        _os.stat(old)
+        if self.there(new):
+            self.remove(new)
+        spend()
+        _os.rename(old, new)
+    def remove(self, name):
+        spend()
+        _os.remove(name)
+    def rmdir(self, name):
+        spend()
+        _os.rmdir(name)
+    def statvfs(self, path):
+        if free is None:
+            return _os.statvfs(path)
+        used = sum([self.used(name) for name in _os.listdir(".")])
+        return (512, 512, 0, free // 512 - used, 0, 0, 0, 0, 0, 255)
+    def used(self, path):
+        mode, size = _os.stat(path)[0], _os.stat(path)[6]
+        if mode & 0x4000:
+            return 1 + sum([self.used(path + "/" + name) for name in _os.listdir(path)])
+        return (size + 511) // 512
+sys.modules["os"] = Os()
+"""
+
 # Runs a line of JSON (the code) in one namespace; the answer: a line of JSON [output, error or null]
 _SERVER = """
-import json, sys, io
+import json, io
 space = {}
 def show(*values, end="\\n", sep=" "):
     out.append(sep.join([str(v) for v in values]) + end)
@@ -18,6 +63,7 @@ while True:
     line = sys.stdin.readline()
     if not line:
         break
+    spend()
     out = []
     error = None
     try:
@@ -29,20 +75,35 @@ while True:
     sys.stdout.write(json.dumps(["".join(out), error]) + "\\n")
 """
 
+_BOOT = """
+class Machine:
+    @staticmethod
+    def soft_reset():
+        sys.exit(8)
+sys.modules["machine"] = Machine
+sys.path.append("lib")
+for name in ("boot.py", "main.py"):
+    try:
+        with open(name) as file:
+            text = file.read()
+    except OSError:
+        continue
+    exec(text, {"__name__": "__main__"})
+"""
+
 
 class PowerCut(Exception):
     """The board lost its power (and its program) as the test wanted it."""
 
 
 class UnixBoard(Transport):
-    """folder: its file system. actions_left: how many commands it still carries out; None: all."""
+    """folder: its file system. left: how many steps it still carries out; None: all. free: bytes of its file system,
+    in blocks of 512; None: many."""
 
-    def __init__(self, folder, actions_left=None):
-        self.actions_left = actions_left
-        self.actions = 0
+    def __init__(self, folder, left=None, free=None):
         start, _ = runtimes.interpreter(simulate.best_runtime())
         self._process = subprocess.Popen(
-            [*start, "-c", _SERVER],
+            [*start, "-c", _OS % (left, free) + _SERVER],
             cwd=folder,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -50,14 +111,16 @@ class UnixBoard(Transport):
         )
 
     def exec(self, command, data_consumer=None):
-        if self.actions_left is not None and self.actions >= self.actions_left:
+        command = command.decode() if isinstance(command, bytes) else command
+        try:
+            self._process.stdin.write(json.dumps(command) + "\n")
+            self._process.stdin.flush()
+        except BrokenPipeError:
+            raise PowerCut from None
+        answer = self._process.stdout.readline()
+        if not answer:
             self.close()
             raise PowerCut
-        self.actions += 1
-        command = command.decode() if isinstance(command, bytes) else command
-        self._process.stdin.write(json.dumps(command) + "\n")
-        self._process.stdin.flush()
-        answer = self._process.stdout.readline()
         output, error = json.loads(answer)
         if error:
             raise TransportExecError(1, error)
@@ -74,3 +137,13 @@ class UnixBoard(Transport):
     def close(self):
         self._process.kill()
         self._process.wait()
+
+
+def boot(folder, left=None, then=""):
+    """Boot the board: boot.py, main.py, and `then` at its prompt -> subprocess.CompletedProcess."""
+    start, _ = runtimes.interpreter(simulate.best_runtime())
+    code = _OS % (left, None) + _BOOT + then
+    while True:
+        done = subprocess.run([*start, "-c", code], cwd=folder, capture_output=True, text=True)
+        if done.returncode != SOFT_RESET:
+            return done

@@ -4,6 +4,7 @@
 import sys
 
 import machine
+import micropython
 
 try:
     import pyb
@@ -41,6 +42,10 @@ def make_tick(rate, callback, pyb_timer=None, timer_id=-1, microseconds=None):
                   None: judged by the port's name
     Raises ValueError for a rate that the timer cannot keep within TOLERANCE_PPM.
     """
+    if hasattr(micropython, "alloc_emergency_exception_buf"):  # built in on most boards
+        micropython.alloc_emergency_exception_buf(
+            100
+        )  # an exception in a hard callback has no heap
     num, den = rate if isinstance(rate, tuple) else (rate, 1)
     if num <= 0 or den <= 0:
         raise ValueError("tick rate must be positive, got %d/%d Hz" % (num, den))

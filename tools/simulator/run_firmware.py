@@ -1,4 +1,4 @@
-# Boots the firmware (boot.py, main.py) on the simulated board: chips on its buses, a moving world under them.
+# Boots the firmware (main.py) on the simulated board: chips on its buses, a moving world under them.
 # Run by `upright demo` and the tests on every runtime. Argument: a JSON file, see CONFIG.
 # Lines on standard output that begin with a tab are for the host; the rest is the board's console.
 
@@ -139,7 +139,6 @@ def main():
     if recorder:
         recorder.main = program
     try:
-        execute("boot.py", {"__name__": "__main__"})
         execute("main.py", program)
     except kernel.PowerOff:
         pass

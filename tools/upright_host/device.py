@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass
 
 LEAST_VERSION = (1, 22)
-# sys.implementation._mpy >> 10 (MicroPython's docs, reference/mpyfiles)
+# sys.implementation._mpy >> 10 & 15 (MicroPython's docs, reference/mpyfiles; flags of the architecture stand above)
 _ARCHITECTURES = (
     *("", "x86", "x64", "armv6", "armv6m", "armv7m", "armv7em", "armv7emsp", "armv7emdp"),
     *("xtensa", "xtensawin", "rv32imc", "rv64imc"),
@@ -21,11 +21,21 @@ def _has(code):
         return True
     except Exception:
         return False
+def _frozen():
+    path = sys.path[:]
+    sys.path[:] = ['.frozen']
+    try:
+        return getattr(__import__('upright'), '__version__', '?')
+    except ImportError:
+        return ''
+    finally:
+        sys.path[:] = path
+        sys.modules.pop('upright', None)
 _m = getattr(sys.implementation, '_mpy', 0)
 _s = os.statvfs(os.getcwd())
 print(repr((sys.platform, getattr(sys.implementation, '_machine', ''), tuple(sys.implementation.version[:3]), _m,
  _has('@micropython.viper\\ndef f():\\n pass'), _has('import pyb\\npyb.Timer'), _has('import machine\\nmachine.Timer'),
- _has('import framebuf'), _s[0] * _s[3])))
+ _has('import framebuf'), _s[0] * _s[3], _frozen())))
 """
 
 
@@ -48,6 +58,7 @@ class Facts:
     machine_timer: bool
     framebuf: bool
     free_bytes: int
+    frozen: str = ""  # the version of Upright that is in the firmware, "" when there is none
 
     def problems(self) -> list[str]:
         """What keeps Upright from running there."""
@@ -120,20 +131,20 @@ def _emulated():
 def facts(transport) -> Facts:
     """Ask a board what it is."""
     answer = ast.literal_eval(transport.exec(_QUESTIONS).decode().strip().splitlines()[-1])
-    platform, machine, version, mpy, viper, pyb, timer, framebuf, free = answer
-    index = mpy >> 10
+    platform, machine, version, mpy, viper, pyb, timer, framebuf, free, frozen = answer
+    index = mpy >> 10 & 15
     architecture = _ARCHITECTURES[index] if index < len(_ARCHITECTURES) else f"number {index}"
     return Facts(
         platform, machine, version, mpy & 0xFF, mpy >> 8 & 3, architecture, viper, pyb, timer,
-        framebuf, free,
+        framebuf, free, frozen,
     )  # fmt: skip
 
 
-def free_bytes(transport) -> int:
-    """What is free of a board's file system."""
+def space(transport) -> tuple[int, int]:
+    """(bytes of a block, bytes that are free) of a board's file system."""
     transport.exec("import os")
     status = transport.eval("os.statvfs(os.getcwd())")
-    return status[0] * status[3]
+    return status[0], status[0] * status[3]
 
 
 def restart(transport, seconds: float, on_line):

@@ -9,7 +9,7 @@ import typer
 from mpremote.transport import TransportError
 from rich.console import Console
 
-from upright_host import device, flash, paths, runtimes, simulate
+from upright_host import contents, device, paths, runtimes, simulate
 
 DOCTOR = paths.SIMULATOR / "run_doctor.py"
 _MARK = "\x1e"  # before the list of problems, which no console line begins with
@@ -29,7 +29,7 @@ def examine(transport, axes: bool, south: bool, on_line) -> list[str]:
     for name in ("board.py", "lib/upright_app/doctor.mpy"):
         if not transport.fs_exists(name) and not transport.fs_exists(name.replace(".mpy", ".py")):
             raise device.DeviceError(f"{name} is not on the board: `upright flash BOARD` first")
-    wanted = flash.setting(transport.fs_readfile("board.py").decode(), "PLATFORM")
+    wanted = contents.setting(transport.fs_readfile("board.py").decode(), "PLATFORM")
     if wanted and wanted != found.platform:
         problems.append(f"board.py is for the port {wanted!r}, this is {found.platform!r}")
     call = f"doctor.axes(board, {south})" if axes else "doctor.report(board)"

@@ -1,172 +1,193 @@
 """Installs Upright on a board: compiled for its processor, only what changed, verified, and never half.
 
-New files go beside the old ones first, with .new behind their names; when all are there and right, a journal that names
-them is put in place with one rename, and only then do they take the old ones' places. Whatever interrupts this, the
-board has either the old files or, after the next boot (upright_app/update.py follows the journal), the new ones.
+The new files are staged in a folder first. When all are there and right, one rename puts /upright.py in place
+(firmware/upright_app/installation.py), which names them: that is the moment from which the installation holds. It then
+puts each in its place, and goes. Whatever interrupts this, the board has the old files, or the new ones as soon as
+main.py or another program says `import upright`.
+
+What an installation changes or removes was put there by one (RECORD has its hash) or is kept as NAME.bak (--force).
 """
 
 import ast
 import hashlib
 import json
-import subprocess
-import tempfile
-from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from dataclasses import dataclass, field
+from pathlib import PurePosixPath
 
 import typer
 from mpremote.transport import TransportError, TransportExecError
 from rich.console import Console
 from rich.progress import Progress
 
-from upright_host import __version__, device, packages, paths, registry, runtimes
+from upright_host import __version__, contents, device, paths, runtimes
 
 RECORD = "upright.json"  # on the board: what was installed, {"version": , "files": {name: sha256}}
-JOURNAL, NEW = "update.json", ".new"  # as in upright_app/update.py
-# Sources on the board as well: the first two are run, not imported; the third is there to be edited.
-SOURCES = ("boot.py", "main.py", "board.py")
-# A user's own, if it is not what was installed: kept, unless --force
+STAGE, SELF = "upright.new", "upright.py"  # as in upright_app/installation.py
+MARK = "# Finishes an installation of Upright"  # its first line begins so
+BACKUP = ".bak"
+SPARE = 8192  # bytes that an installation leaves free: calibration, the user's own files
+FOLDER = "folder"  # in place of a hash
+# A user's own, if it is not what was installed: kept, and the rest is installed all the same
 KEPT = ("main.py", "board.py")
-# On the board: prints the hash of each file, or None
-_HASH = """
-import hashlib, binascii
+# What a new board's main.py holds (MicroPython's ports/stm32/factoryreset.c): nobody's program
+FACTORY = hashlib.sha256(b"# main.py -- put your code here!\r\n").hexdigest()
+# In the root they are imported before what lies in /lib
+SHADOWS = tuple(p + form for p in ("upright", "upright_app") for form in ("", ".py", ".mpy"))
+# Stands in for main.py while that is replaced
+BOOT = b"""# Put here by `upright flash` for as long as it replaces main.py
+try:
+    import upright
+except ImportError:
+    pass
+"""
+FOLDERS = ("lib", "lib/upright", "lib/upright_app")
+OLD_CALIBRATION, CALIBRATION = "calibration.json", "upright_cal.json"
+
+# On the board: prints hash (None without a file) and size of each file
+_LOOK = """
+import os
+{hashing}
 _b = memoryview(bytearray(1024))
 for _name in {names!r}:
     try:
-        _f = open(_name, 'rb')
+        _s = os.stat(_name)
     except OSError:
-        print(None)
+        print(None, 0)
         continue
-    _h = hashlib.sha256()
-    while True:
-        _n = _f.readinto(_b)
-        if not _n:
-            break
-        _h.update(_b[:_n])
-    _f.close()
-    print(binascii.hexlify(_h.digest()).decode())
+    if _s[0] & 0x4000:
+        print({folder!r}, 0)
+        continue
+    _h = {sha}
+    with open(_name, 'rb') as _f:
+        while _h:
+            _n = _f.readinto(_b)
+            if not _n:
+                break
+            _h.update(_b[:_n])
+    print(binascii.hexlify(_h.digest()).decode() if _h else '?', _s[6])
+"""
+_COPY = """
+with open({a!r}, 'rb') as _f:
+    with open({b!r}, 'wb') as _g:
+        while True:
+            _d = _f.read(512)
+            if not _d:
+                break
+            _g.write(_d)
+"""
+# Files of the stage that was left by an installation that never came to hold
+_CLEAR = """
+import os
+try:
+    for _f in os.listdir({stage!r}):
+        os.remove({stage!r} + '/' + _f)
+    os.rmdir({stage!r})
+except OSError:
+    pass
 """
 
 
 @dataclass
 class Plan:
-    """What an installation does. install: {name: content}; remove: names; kept: names of the user's own files;
-    same: how many are as they should be; record: what RECORD is to hold."""
+    """What an installation does.
 
-    install: dict
-    remove: list
-    kept: list
-    same: int
-    record: dict
-
-
-def board_files(
-    board: str, facts: device.Facts, source: bool = False, own: str | None = None
-) -> dict[str, bytes]:
-    """Every file of an installation: {name on the board: content}. Raises device.DeviceError.
-
-    own: the text of another board.py, which may stay on the board; what it needs is installed as well.
+    install  {name: content}; remove: names; record: what RECORD is to hold
+    same     how many files are as they should be
+    kept     of the user's, left as they are: (name, why)
+    blocked  of the user's, in the way: (name, why and what to do); then nothing is done
+    backup   names that are copied to NAME.bak first (a folder: renamed)
+    found    {name: (hash or None or FOLDER, bytes)} of what the board has
     """
-    folder = paths.BOARDS / board
-    if not (folder / "board.py").exists():
-        known = ", ".join(sorted(p.parent.name for p in paths.BOARDS.glob("*/board.py")))
-        raise device.DeviceError(f"unknown board {board!r}; there are {known}")
-    compiler = None if source else _compiler(facts)
-    files = {"board.py": (folder / "board.py").read_bytes()}
-    needed = library(files["board.py"].decode()) | (library(own) if own else set())
-    for path in sorted(paths.FIRMWARE.glob("*.py")):
-        files[path.name] = path.read_bytes()
-    for name, path in paths.board_modules().items():
-        if path.parent == paths.PACKAGE and path.stem not in needed:
-            continue
-        if compiler:
-            files[f"{name}.mpy"] = _compile(compiler, facts.architecture, path)
-        else:
-            files[f"{name}.py"] = path.read_bytes()
-    return files
 
-
-def library(text: str) -> set[str]:
-    """The modules of lib/ that the firmware needs with a board.py of this text: many boards have no room for all.
-
-    Of the filters the one that it names; without one, the firmware's default; where its name is worked out, all.
-    """
-    module = {name: module for name, (module, _) in registry.filters().items()}
-    try:
-        chosen = setting(text, "FILTER")
-        wanted = {module[chosen]} if chosen in module else {module["inertial9"]}
-    except ValueError:
-        wanted = set(module.values())
-    imported = packages.imports(ast.parse(text))
-    for path in paths.FIRMWARE.rglob("*.py"):
-        imported |= packages.imports(ast.parse(path.read_text()))
-    return {m for name in wanted | imported for m in packages.modules(name)}
-
-
-def setting(text: str, name: str):
-    """What a file of Python sets a name to, None when it does not. Raises ValueError when that is no constant."""
-    for node in ast.parse(text).body:
-        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == name:
-            return ast.literal_eval(node.value)
-    return None
-
-
-def _compiler(facts: device.Facts) -> Path:
-    """The mpy-cross whose files the board can load."""
-    tried = []
-    for version in runtimes.MPY_CROSS_VERSIONS:
-        compiler = runtimes.mpy_cross(version)
-        with tempfile.TemporaryDirectory() as here:
-            (Path(here) / "a.py").write_text("@micropython.viper\ndef f():\n    pass\n")
-            out = Path(here) / "a.mpy"
-            march = [f"-march={facts.architecture}"]
-            done = subprocess.run(
-                [compiler, *march, "-o", out, Path(here) / "a.py"], capture_output=True
-            )
-            if done.returncode:
-                tried.append(f"{version} does not know {facts.architecture}")
-                continue
-            head = out.read_bytes()
-        # byte 1: version; byte 2, bits 1..0: sub-version of native code (MicroPython's docs, reference/mpyfiles)
-        if (head[1], head[2] & 3) == (facts.mpy_version, facts.mpy_sub_version):
-            return compiler
-        tried.append(f"{version} writes .mpy version {head[1]}.{head[2] & 3}")
-    raise device.DeviceError(
-        f"no mpy-cross at hand for .mpy version {facts.mpy_version}.{facts.mpy_sub_version} on {facts.architecture} "
-        f"({'; '.join(tried)}); --source installs the sources instead"
-    )
-
-
-def _compile(compiler: Path, architecture: str, path: Path) -> bytes:
-    with tempfile.TemporaryDirectory() as here:
-        out = Path(here) / "out.mpy"
-        command = [compiler, f"-march={architecture}", "-O2", "-s", path.name, "-o", out, path]
-        done = subprocess.run(command, capture_output=True, text=True)
-        if done.returncode:
-            raise device.DeviceError(f"{path.name} does not compile: {done.stderr.strip()}")
-        return out.read_bytes()
+    install: dict = field(default_factory=dict)
+    remove: list = field(default_factory=list)
+    record: dict = field(default_factory=dict)
+    same: int = 0
+    kept: list = field(default_factory=list)
+    blocked: list = field(default_factory=list)
+    backup: list = field(default_factory=list)
+    found: dict = field(default_factory=dict)
 
 
 def plan(transport, files: dict[str, bytes], force: bool = False) -> Plan:
-    """Compare the board's files with what they are to be."""
-    record = _read_record(transport)
-    before = record.get("files", {})
-    others = {name: _other_form(name) for name in files}
-    hashes = _hashes(transport, [*files, *others.values()])
-    install, kept, same = {}, [], 0
-    for name, content in files.items():
-        wanted = hashlib.sha256(content).hexdigest()
-        found = hashes[name]
-        if found == wanted:
-            same += 1
-        elif name in KEPT and found is not None and found != before.get(name) and not force:
-            kept.append(name)
+    """Compare the board's files with what they are to be. Nothing is changed by it but an older installation that was
+    cut off: that is finished first."""
+    ours = _finish(transport)
+    recorded = _read_record(transport).get("files", {})
+    others = {name: _other_form(name) for name in files if name not in KEPT}
+    root = [f.name for f in transport.fs_listdir("") if not f.st_mode & 0x4000]
+    programs = [name for name in root if name.endswith(".py") and name not in SHADOWS]
+    names = [*files, *others.values(), *recorded, *SHADOWS, *programs]
+    names += [RECORD, "boot.py", OLD_CALIBRATION, CALIBRATION, *FOLDERS]
+    found = look(transport, list(dict.fromkeys(names)))
+    made = Plan(found=found)
+
+    def state(name):
+        """None: there is none; True: an installation put it there; else why it is the user's."""
+        digest = found[name][0]
+        if digest is None:
+            return None
+        if name in ours or (digest == recorded.get(name) and digest != FOLDER):
+            return True
+        if name == "boot.py" and digest == hashlib.sha256(BOOT).hexdigest():
+            return True
+        return "changed since it was installed" if name in recorded else "not installed by Upright"
+
+    def in_the_way(name, why):
+        if force:
+            made.backup.append(name)
         else:
-            install[name] = content
-    # a .py is imported before a .mpy of its name, and what is no longer part of it only takes space
-    remove = [name for name in others.values() if name not in files and hashes[name] is not None]
-    remove += [name for name in before if name not in files and name not in remove]
+            made.blocked.append((name, why))
+        return force
+
+    for name, content in files.items():
+        digest = hashlib.sha256(content).hexdigest()
+        is_ours = state(name)
+        if found[name][0] == digest:
+            made.same += 1
+        elif is_ours in (None, True) or (name == "main.py" and found[name][0] == FACTORY):
+            made.install[name] = content
+        elif name in KEPT and not force:
+            made.kept.append((name, is_ours))
+        elif in_the_way(name, is_ours):
+            made.install[name] = content
+    for name in FOLDERS:
+        if found[name][0] not in (None, FOLDER):
+            made.blocked.append((name, "a file where a folder is needed; rename it"))
+    # a .py is imported before a .mpy of its name, and a file in the root before one in /lib
+    for name in [*others.values(), *SHADOWS]:
+        is_ours = state(name)
+        if name in files or is_ours is None:
+            continue
+        what = others_of(name, files)
+        free = is_ours is True or in_the_way(
+            name, f"{is_ours}, and would be imported instead of {what}"
+        )
+        if free and name != SELF:  # that one is replaced by ours, and goes with it
+            made.remove.append(name)
+    for name in {**recorded, "boot.py": ""}:
+        if name not in files and name not in made.remove and state(name) is True:
+            made.remove.append(name)
+        elif name in recorded and name not in {*files, *others.values()} and state(name):
+            made.kept.append(
+                (name, "no longer part of Upright, but changed since it was installed")
+            )
+    _check_programs(
+        transport, made, [n for n in programs if isinstance(state(n), str)], programs, force
+    )
+    is_older = any(PurePosixPath(n).stem in contents.MOVED for n in _flat(recorded))
+    if is_older and found[CALIBRATION][0] is None and found[OLD_CALIBRATION][0] is not None:
+        made.install[CALIBRATION] = bytes(transport.fs_readfile(OLD_CALIBRATION))
+    kept = {name for name, _ in made.kept}
     installed = {n: hashlib.sha256(c).hexdigest() for n, c in files.items() if n not in kept}
-    return Plan(install, remove, kept, same, {"version": __version__, "files": installed})
+    made.record = {"version": __version__, "files": installed}
+    return made
+
+
+def others_of(name: str, files: dict) -> str:
+    """What a file stands in the way of, for people."""
+    other = _other_form(name)
+    return other if other in files else f"lib/{PurePosixPath(name).stem}"
 
 
 def _other_form(name: str) -> str:
@@ -175,40 +196,165 @@ def _other_form(name: str) -> str:
     return f"{stem}.{'py' if form == 'mpy' else 'mpy'}"
 
 
-def execute(transport, plan: Plan, on_progress=None):
-    """Carry a plan out. on_progress(name, bytes done, bytes in all). Raises device.DeviceError.
+def _check_programs(transport, made: Plan, own: list[str], root: list[str], force: bool):
+    """The user's programs that would no longer start: lines to change, instead of an ImportError at the next boot."""
+    gone = {PurePosixPath(name).stem for name in _flat(made.remove)}
+    gone = {n for n in gone & contents.MOVED.keys() if f"{n}.py" not in {*root} - {*made.remove}}
+    for name in own:
+        if name in made.install or (name != "board.py" and not gone):
+            continue
+        text = transport.fs_readfile(name).decode("utf-8", "replace")
+        lines = contents.lines_to_change(text, gone, name == "board.py")
+        if lines and not (force and name != "board.py"):
+            todo = "not made for this version. Change it, or replace it by ours (--force):"
+            if name != "board.py":
+                todo = "it imports what has moved. Change it, or let it fail (--force):"
+            made.blocked.append((name, "\n    ".join([todo, *lines])))
 
-    Interrupted at any point, the board keeps the old files or gets the new ones at its next boot.
+
+def _flat(names) -> list[str]:
+    """Those in the root and in /lib, where older installations had their modules."""
+    return [name for name in names if str(PurePosixPath(name).parent) in (".", "lib")]
+
+
+def _finish(transport) -> set[str]:
+    """Finish an earlier installation that was cut off -> names of files that are ours whatever their hash."""
+    transport.exec(
+        "import os\ntry:\n    os.stat('update.json')\n    import update\n    update.finish()\n"
+        "except (OSError, ImportError):\n    pass"  # as older versions of Upright do
+    )
+    try:
+        text = transport.fs_readfile(SELF).decode()
+    except (OSError, UnicodeDecodeError):
+        return set()
+    if not text.startswith(MARK):
+        return set()
+    transport.exec(f"exec(open({SELF!r}).read(), {{'__name__': 'finish'}})")
+    call = ast.parse(text).body[-1].value
+    return set(ast.literal_eval(call.args[0])) | {SELF} if call.func.id == "refuse" else set()
+
+
+# ------------------------------------------------------------------------------------------ carrying it out
+
+
+def execute(transport, plan: Plan, on_progress=None) -> bool:
+    """Carry a plan out -> False where old and new had no room together. on_progress(name, bytes done, bytes in all).
+
+    Raises device.DeviceError, before anything is changed, where it cannot be done at all.
     """
-    # What the next boot would do, for an earlier installation that was interrupted
-    transport.exec((paths.APPLICATION / "update.py").read_text() + "\nfinish()")
-    record = json.dumps(plan.record).encode()
-    files = plan.install | {RECORD: record}
-    total, done = sum(map(len, files.values())), 0
-    free = device.free_bytes(transport)
-    if total + 8192 > free:
-        raise device.DeviceError(f"{total} bytes do not fit: {free} are free on the board")
-    folders = {str(parent) for name in files for parent in PurePosixPath(name).parents} - {"."}
-    for folder in sorted(folders):
+    if plan.blocked:
+        listed = "\n".join(f"{name}: {why}" for name, why in plan.blocked)
+        raise device.DeviceError(
+            f"nothing was changed. In the way:\n{listed}\n"
+            "Rename or remove it, or let --force do so (it keeps a copy, NAME.bak)"
+        )
+    transport.exec(_CLEAR.format(stage=STAGE))
+    files = plan.install | {RECORD: json.dumps(plan.record).encode()}
+    remove = list(plan.remove)
+    # main.py first, then whatever boots is new. Where the file system cannot replace it in one step it is missing for a
+    # moment: a boot.py stands in, unless the user has one.
+    order = sorted(files, key=lambda name: (name != "main.py", name == RECORD))
+    is_replaced = "main.py" in files and plan.found["main.py"][0]
+    stand_in = is_replaced and (plan.found["boot.py"][0] is None or "boot.py" in remove)
+    if stand_in and "boot.py" not in remove:
+        remove.append("boot.py")
+    block, free = device.space(transport)
+
+    def room(sizes):
+        return sum(-(-size // block) * block for size in sizes)
+
+    sizes = [*map(len, files.values()), *(plan.found[name][1] for name in plan.backup)]
+    need = room([*sizes, len(_in_front(f"finish({order!r}, {remove!r})"))])
+    need += _room_of_folders(plan, files, block)
+    freed = room(plan.found.get(name, (None, 0))[1] for name in {*files, *remove, SELF})
+    if need + SPARE > free + freed:
+        raise device.DeviceError(
+            f"{need} bytes and {SPARE} to spare do not fit: {free} are free on the board and {freed} would "
+            "become so. Nothing was changed. Remove files of your own, or freeze Upright into the firmware "
+            "(README.md of the board)"
+        )
+    staged = need + SPARE <= free
+    _make_folders(transport, [*files, f"{STAGE}/{SELF}"])
+    _back_up(transport, plan)
+    if staged:
+        sent = {f"{STAGE}/{i}": files[name] for i, name in enumerate(order)}
+        _send(transport, sent, dict(zip(sent, order, strict=True)), on_progress)
+        if stand_in:
+            _send(transport, {f"{STAGE}/boot.py": BOOT}, {}, None)
+            transport.exec(f"import os\nos.rename('{STAGE}/boot.py', 'boot.py')")
+        _put_in_front(transport, f"finish({order!r}, {remove!r})")
+        transport.exec(f"exec(open({SELF!r}).read(), {{'__name__': 'finish'}})")
+    else:
+        _put_in_front(transport, f"refuse({sorted({*order, *remove})!r})")
+        for name in [*(n for n in order if n != RECORD), *remove]:
+            transport.exec(f"import os\ntry:\n    os.remove({name!r})\nexcept OSError:\n    pass")
+        _send(transport, {name: files[name] for name in order}, {}, on_progress)
+        transport.exec(f"import os\nos.rmdir({STAGE!r})\nos.remove({SELF!r})")
+    return staged
+
+
+def _room_of_folders(plan: Plan, files, block: int) -> int:
+    """Bytes that folders take, at most. A new one is a block on FAT, two on littlefs, whose blocks are larger; a new
+    file's entry, with a long name, is 96 bytes on FAT, in the folder of the staged ones 32."""
+    new = 1 + sum(plan.found.get(name, (None,))[0] is None for name in _folders(files))
+    entries = sum(32 + 96 * (plan.found.get(name, (None,))[0] is None) for name in files)
+    return new * block * (1 if block < 4096 else 2) + -(-entries // block) * block
+
+
+def _folders(files) -> list[str]:
+    found = {str(parent) for name in files for parent in PurePosixPath(name).parents}
+    return sorted(found - {"."})
+
+
+def _make_folders(transport, names):
+    for folder in _folders(names):
         if not transport.fs_exists(folder):
             transport.fs_mkdir(folder)
+
+
+def _back_up(transport, plan: Plan):
+    for name in plan.backup:
+        copy, n = name + BACKUP, 1
+        while transport.fs_exists(copy):
+            n += 1
+            copy = f"{name}{BACKUP}{n}"
+        if plan.found[name][0] == FOLDER:
+            transport.exec(f"import os\nos.rename({name!r}, {copy!r})")
+        else:
+            transport.exec(_COPY.format(a=name, b=copy))
+
+
+def _send(transport, files: dict[str, bytes], called: dict[str, str], on_progress):
+    """Write files and look whether they are what was sent. called: what people know them by."""
+    total, done = sum(map(len, files.values())), 0
     for name, content in files.items():
-        start = done
+        start, title = done, called.get(name, name)
 
-        def written(part, _, name=name, start=start):
+        def written(part, _, title=title, start=start):
             if on_progress:
-                on_progress(name, start + part, total)
+                on_progress(title, start + part, total)
 
-        transport.fs_writefile(name + NEW, content, progress_callback=written)
+        transport.fs_writefile(name, content, progress_callback=written)
         done += len(content)
-        if transport.fs_hashfile(name + NEW, "sha256") != hashlib.sha256(content).digest():
+        if transport.fs_hashfile(name, "sha256") != hashlib.sha256(content).digest():
             raise device.DeviceError(
-                f"{name}: what the board holds is not what was sent; try again"
+                f"{title}: what the board holds is not what was sent; try again"
             )
-    journal = {"install": list(files), "remove": plan.remove}
-    transport.fs_writefile(JOURNAL + NEW, json.dumps(journal).encode())
-    transport.exec(f"import os\nos.rename({JOURNAL + NEW!r}, {JOURNAL!r})")
-    transport.exec("finish()")
+
+
+def _in_front(call: str) -> bytes:
+    return (paths.APPLICATION / "installation.py").read_bytes() + f"\n\n{call}\n".encode()
+
+
+def _put_in_front(transport, call: str):
+    """Put /upright.py in place, which `import upright` finds before lib/upright."""
+    staged = f"{STAGE}/{SELF}"
+    _send(transport, {staged: _in_front(call)}, {}, None)
+    # it may be there already: from an installation that was cut off, or the user's, of which there is a copy
+    transport.exec(
+        f"import os\ntry:\n    os.remove({SELF!r})\nexcept OSError:\n    pass\n"
+        f"os.rename({staged!r}, {SELF!r})"
+    )
 
 
 def _read_record(transport) -> dict:
@@ -219,77 +365,92 @@ def _read_record(transport) -> dict:
     return record if isinstance(record, dict) else {}
 
 
-def _hashes(transport, names) -> dict[str, str | None]:
-    """SHA-256 of each file on the board, None where there is none. One command for all: each costs a round trip."""
+def look(transport, names: list[str]) -> dict[str, tuple[str | None, int]]:
+    """(SHA-256, bytes) of each file on the board, (None, 0) where there is none, (FOLDER, 0) of a folder. One command
+    for all: each costs a round trip."""
     try:
-        said = transport.exec(_HASH.format(names=list(names))).decode().split()
-    except TransportExecError:
-        return {name: _hash(transport, name) for name in names}  # no hashlib there
-    return {n: None if h == "None" else h for n, h in zip(names, said, strict=True)}
+        said = transport.exec(
+            _LOOK.format(
+                names=names,
+                folder=FOLDER,
+                hashing="import hashlib, binascii",
+                sha="hashlib.sha256()",
+            )
+        ).decode()
+    except TransportExecError:  # no hashlib there
+        said = transport.exec(_LOOK.format(names=names, folder=FOLDER, hashing="", sha="None"))
+        said = said.decode()
+    found = {}
+    for name, line in zip(names, said.strip().splitlines(), strict=True):
+        digest, size = line.split()
+        if digest == "?":
+            digest = transport.fs_hashfile(name, "sha256").hex()
+        found[name] = (None if digest == "None" else digest, int(size))
+    return found
 
 
-def _hash(transport, name: str) -> str | None:
-    try:
-        return transport.fs_hashfile(name, "sha256").hex()
-    except OSError:
-        return None
+# ------------------------------------------------------------------------------------------ the command
 
 
-def run(transport, board: str, source: bool, force: bool, console) -> bool:
+def run(
+    transport, board: str, source: bool, force: bool, console, everything: bool = False
+) -> bool:
     """Install on a connected board, with progress -> whether anything was changed. Raises device.DeviceError."""
+
+    def say(text):
+        console.print(text, highlight=False, markup=False)
+
     found = device.facts(transport)
     version = ".".join(map(str, found.version))
-    console.print(
-        f"{found.machine or found.platform}: MicroPython {version}, {found.architecture}",
-        highlight=False,
-    )
+    say(f"{found.machine or found.platform}: MicroPython {version}, {found.architecture}")
     problems = found.problems()
     if problems:
         raise device.DeviceError("; ".join(problems))
-    platform = board_platform(board)
-    if platform and platform != found.platform:
+    wanted = contents.platform(board)
+    if wanted and wanted != found.platform:
         raise device.DeviceError(
-            f"boards/{board} is for MicroPython's port {platform!r}; this board runs {found.platform!r}"
+            f"boards/{board} is for MicroPython's port {wanted!r}; this board runs {found.platform!r}"
         )
-    steps = plan(transport, board_files(board, found, source, _own(transport)), force)
-    for name in steps.kept:
-        console.print(
-            f"{name} on the board is your own: kept (--force replaces it)", highlight=False
-        )
+    if found.frozen:
+        say(f"Upright {found.frozen} is frozen into this firmware, and is what will run")
+    files = contents.board_files(board, found, source, _own(transport), everything)
+    steps = plan(transport, files, force)
+    for name, why in steps.kept:
+        can = " (--force replaces it, and keeps a copy as NAME.bak)" if name in KEPT else ""
+        say(f"{name}: {why}: kept as it is{can}")
     size = sum(map(len, steps.install.values()))
-    console.print(
+    say(
         f"{steps.same} files are as they should be, {len(steps.install)} to copy ({size} bytes), "
-        f"{len(steps.remove)} to remove",
-        highlight=False,
+        f"{len(steps.remove)} to remove"
     )
-    if not steps.install and not steps.remove:
+    if not (steps.install or steps.remove or steps.blocked or steps.backup):
         return False
     with Progress(console=console) as progress:
         task = progress.add_task("copying", total=None)
-        execute(
+        staged = execute(
             transport,
             steps,
             lambda name, done, total: progress.update(
                 task, completed=done, total=total, description=name
             ),
         )
-    console.print("verified by hash and put in place")
+    say("verified by hash and put in place")
+    if not staged:
+        say("(in the place of the old files, since there was no room beside them)")
     return True
 
 
-def _own(transport) -> str | None:
-    """The text of the board.py that is on the board."""
-    try:
-        text = transport.fs_readfile("board.py").decode()
-        ast.parse(text)
-    except (OSError, ValueError, SyntaxError):
-        return None
-    return text
-
-
-def board_platform(board: str) -> str | None:
-    """The MicroPython port that a board's board.py is for (its PLATFORM), None when it says nothing."""
-    return setting((paths.BOARDS / board / "board.py").read_text(), "PLATFORM")
+def _own(transport) -> str:
+    """The text of the user's board.py and main.py that are on the board, where they are Python."""
+    texts = []
+    for name in KEPT:
+        try:
+            text = transport.fs_readfile(name).decode()
+            ast.parse(text)
+            texts.append(text)
+        except (OSError, ValueError, SyntaxError):
+            pass
+    return "\n".join(texts)
 
 
 def register(app: typer.Typer):
@@ -300,7 +461,14 @@ def register(app: typer.Typer):
         board: str = typer.Argument(..., help="The board, a folder of boards/."),
         port: str = typer.Option(None, help="Its serial port (default: the only one there is)."),
         source: bool = typer.Option(False, help="Install sources, not compiled modules."),
-        force: bool = typer.Option(False, help="Replace a main.py or board.py of your own, too."),
+        everything: bool = typer.Option(
+            False,
+            "--all",
+            help="Install every module, not only those that the board's settings need.",
+        ),
+        force: bool = typer.Option(
+            False, help="Replace files of your own that are in the way; a copy stays as NAME.bak."
+        ),
         seconds: float = typer.Option(
             None,
             help="Show what the board says after its restart for so long (default: 5, emulated 2).",
@@ -312,13 +480,12 @@ def register(app: typer.Typer):
         """Install the firmware on a board over USB: compiled for it, only what changed, verified, never half."""
         console = Console()
         try:
-            if not (paths.BOARDS / board / "board.py").exists():
-                board_files(board, None)
+            contents.board_file(board)
             if emulated and board != "pico":
                 raise device.DeviceError(f"the emulated board is a Pico, not {board}")
             transport = device.open_board(port, emulated)
             try:
-                run(transport, board, source, force, console)
+                run(transport, board, source, force, console, everything)
                 console.print("restarting:")
                 device.restart(
                     transport,

@@ -158,7 +158,7 @@ class Board:
         return self._console.decode(errors="replace")
 
     def boot(self, seconds=5) -> "Board":
-        """Run until the firmware's USB is up: boot.py has run, main.py begins."""
+        """Run until the firmware's USB is up: main.py begins."""
         self.run_until(lambda: self.connected, seconds, "USB")
         return self
 

