@@ -1,35 +1,80 @@
-"""`upright doctor`: on a simulated board, and on one whose answers are scripted."""
+"""`upright doctor` and `upright record`: on a simulated board, and from the RAM of one."""
 
 import pytest
+from conftest import require
 from typer.testing import CliRunner
-from upright_host import cli, device, doctor, paths
+from unix_board import UnixBoard
+from upright_host import cli, console, device, doctor, paths, ram, record, recordings
 
 FACTS = device.Facts("rp2", "Pico", (1, 26, 1), 6, 3, "armv6m", True, False, True, True, 900000)
 
 
-class Board:
-    """Answers as a board with the firmware on it."""
-
-    def __init__(self, files, said):
-        self.files = files
-        self.said = said
-        self.ran = []
-
-    def fs_exists(self, name):
-        return name in self.files
-
-    def fs_readfile(self, name):
-        return self.files[name]
-
-    def exec(self, code, data_consumer=None):
-        self.ran.append(code)
-        for piece in self.said:
-            data_consumer(piece)
+BOARD = b"""
+PLATFORM = "linux"
+NAME = "a board"
+RATE = 100
+def sensor():
+    raise OSError("nobody at 0x68")
+def display(chunk):
+    return None
+def make_tick(rate, callback):
+    raise ValueError("no timer here")
+"""
+# A sensor that gives a sample whenever 10 ms have gone by
+SENSOR = b"""
+import time
+from array import array
+from upright import settings
+NAME = "a board"
+class Imu:
+    chip, sample_rate, accel_lsb_per_g, gyro_scale = "MPU6050", (100, 1), 4096, (82, 5)
+    errors = 0
+    def __init__(self):
+        self.counts = array("h", [0] * 11)
+        self.at = time.ticks_us()
+    def configure(self, *a, **k):
+        pass
+    def health(self):
+        pass
+    def read(self):
+        self.counts[10] = 0
+        if time.ticks_diff(time.ticks_us(), self.at) >= 10000:
+            self.at = time.ticks_us()
+            self.counts[2], self.counts[10] = 4096, 1
+        return self.counts[10]
+def sensor():
+    return Imu()
+"""
 
 
 @pytest.fixture
-def known(monkeypatch):
-    monkeypatch.setattr(device, "facts", lambda transport: FACTS)
+def unix(tmp_path):
+    """unix(files) -> a board with these files, which has to end up with these files and no others."""
+    require("unix")
+    made = []
+    folder = tmp_path / "flash"
+    folder.mkdir()
+
+    def listing():
+        return {
+            str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()
+        }
+
+    def make(files):
+        for name, content in files.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(content)
+        made.append((UnixBoard(folder), files))
+        return made[0][0]
+
+    yield make
+    for board, files in made:
+        board.close()
+        assert listing() == files
+
+
+def modules(*names):
+    return {f"lib/upright/{name}.py": (paths.PACKAGE / f"{name}.py").read_bytes() for name in names}
 
 
 def test_a_healthy_simulated_board_and_one_without_its_magnetometer():
@@ -54,36 +99,82 @@ def test_every_board_boots_its_parts_in_simulation(folder):
         assert problems == []
 
 
-def test_lines_of_a_board_are_passed_on_as_they_come_in_whatever_pieces(known):
-    board = Board(
-        {"board.py": b'PLATFORM = "rp2"', "lib/upright_app/doctor.mpy": b""},
-        [b"heap: 1", b"00 bytes\r\nsen", b"sor: x\r\n\x1e['bad']\r\n"],
-    )
+@pytest.mark.parametrize(
+    "there", [(), ("__init__",), ("__init__", "settings", "mpu_common", "mpu_parts")]
+)
+def test_the_doctor_runs_from_ram_with_what_the_board_lacks(unix, there):
     lines = []
-    assert doctor.examine(board, False, False, lines.append) == ["bad"]
-    assert lines[1:] == ["heap: 100 bytes", "sensor: x"]
-    assert "doctor.report(board)" in board.ran[0]
-
-
-def test_the_check_of_the_axes_is_asked_for_by_its_hemisphere(known):
-    board = Board({"board.py": b"", "lib/upright_app/doctor.py": b""}, [b"\x1e[]\n"])
-    assert doctor.examine(board, True, True, print) == []
-    assert "doctor.axes(board, True)" in board.ran[0]
-
-
-def test_a_board_without_the_firmware_or_with_that_of_another_is_named(known):
-    with pytest.raises(device.DeviceError, match="upright flash"):
-        doctor.examine(Board({}, []), False, False, print)
-    board = Board(
-        {"board.py": b'PLATFORM = "esp32"', "lib/upright_app/doctor.mpy": b""}, [b"\x1e[]\n"]
+    problems = doctor.examine(
+        unix({"board.py": BOARD} | modules(*there)), False, False, lines.append
     )
-    assert doctor.examine(board, False, False, print) == [
-        "board.py is for the port 'esp32', this is 'rp2'"
-    ]
+    assert "this build of MicroPython has no timer" in problems
+    assert "tick: no timer here" in problems
+    assert any("nobody at 0x68" in problem for problem in problems)
+    assert "display: none" in lines
+    assert lines[1].startswith("a board, micropython 1.")
+
+
+def test_the_self_test_is_there_for_the_doctor_though_no_installation_has_it(unix):
+    transport = unix({"board.py": BOARD} | modules("__init__", "settings"))
+    doctor.examine(transport, False, False, print)
+    transport.exec("from upright import mpu_selftest\nprint(mpu_selftest.run)")
+
+
+def test_a_board_without_a_board_py_or_for_another_port_is_named(unix):
+    with pytest.raises(device.DeviceError, match="upright flash"):
+        doctor.examine(unix({}), False, False, print)
+
+
+def test_a_board_py_for_another_port_is_named(unix):
+    problems = doctor.examine(
+        unix({"board.py": BOARD.replace(b"linux", b"esp32")}), False, False, print
+    )
+    assert "board.py is for the port 'esp32', this is 'linux'" in problems
+
+
+def test_lines_of_a_board_are_passed_on_as_they_come_in_whatever_pieces():
+    plain, marked = [], []
+    lines = doctor.Lines({"\x1e": marked.append}, plain.append)
+    for piece in (b"heap: 1", b"00 bytes\r\nsen", b"sor: x\r\n\x1e['bad']\r\n"):
+        lines.feed(piece)
+    assert plain == ["heap: 100 bytes", "sensor: x"]
+    assert marked == ["['bad']"]
+
+
+def test_the_check_of_the_axes_is_asked_for_by_its_hemisphere(monkeypatch):
+    ran = []
+
+    class Board:
+        def fs_readfile(self, name):
+            return b""
+
+        def exec(self, code, data_consumer=None):
+            ran.append(code)
+            data_consumer(b"\x1e[]\n")
+
+    monkeypatch.setattr(device, "facts", lambda transport: FACTS)
+    monkeypatch.setattr(ram, "load", lambda *a: None)
+    assert doctor.examine(Board(), True, True, print) == []
+    assert "doctor.axes(board, True)" in ran[0]
+
+
+def test_a_recording_comes_over_the_line_and_nothing_is_written_to_the_board(unix, tmp_path):
+    lines = []
+    transport = unix({"board.py": SENSOR} | modules("__init__", "settings"))
+    file = tmp_path / "rest.imu"
+    size = record.record(transport, file, 1, 100, lines.append)
+    found = recordings.load(file)
+    assert file.stat().st_size == size
+    accel, gyro = found.inertial()
+    assert len(accel) >= 90
+    assert (found.rate, found.chip, found.board) == (100, "MPU6050", "a board")
+    assert {tuple(row) for row in accel.tolist()} == {(0.0, 0.0, 1.0)} or accel[:, 2].std() == 0
+    assert not gyro.any()
+    assert "done" in lines and any("rows" in line for line in lines)
 
 
 @pytest.mark.parametrize("which", [("--simulated", "sim"), ("--emulated",)])
 def test_nobody_turns_a_simulated_board(which):
     done = CliRunner().invoke(cli.app, ["doctor", *which, "--axes"])
-    assert done.exit_code == 1
+    assert done.exit_code == console.WRONG
     assert "real one" in done.output

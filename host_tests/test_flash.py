@@ -10,7 +10,7 @@ from conftest import require
 from mpremote.transport import TransportExecError
 from typer.testing import CliRunner
 from unix_board import POWER_CUT, PowerCut, UnixBoard, boot
-from upright_host import cli, contents, device, flash, paths, runtimes
+from upright_host import cli, console, contents, device, flash, paths, runtimes
 
 MAIN = "import upright\nfrom upright import a\nprint('main %d', upright.VERSION, a.VERSION)"
 OWN_BOOT = b"# mine\n"
@@ -521,7 +521,7 @@ def test_facts_of_a_board_and_files_that_it_can_load(board):
     ):
         assert name not in files
         assert name in contents.board_files("pico", facts, everything=True)
-    with pytest.raises(device.DeviceError, match="unknown board"):
+    with pytest.raises(console.Wrong, match="unknown board"):
         contents.board_files("abacus", facts)
 
 
@@ -596,10 +596,10 @@ def test_several_boards_are_listed_and_none_is_guessed(monkeypatch):
 def test_what_the_emulated_board_needs_is_named_where_it_is_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "rp2040", None)
     with pytest.raises(runtimes.Unavailable, match=r"no emulated board: .*rp2040"):
-        device.open_board(None, emulated=True)
+        device.opened(None, emulated=True).__enter__()
 
 
 def test_only_the_pico_is_emulated():
     done = CliRunner().invoke(cli.app, ["flash", "pico2", "--emulated"])
-    assert done.exit_code == 1
+    assert done.exit_code == console.WRONG
     assert "a Pico, not pico2" in done.output

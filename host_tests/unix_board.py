@@ -54,11 +54,12 @@ sys.modules["os"] = Os()
 
 # Runs a line of JSON (the code) in one namespace; the answer: a line of JSON [output, error or null]
 _SERVER = """
-import json, io
+import builtins, json, io
 space = {}
 def show(*values, end="\\n", sep=" "):
     out.append(sep.join([str(v) for v in values]) + end)
-space["print"] = show
+builtins.print = show  # modules print as well
+sys.path.append("lib")
 while True:
     line = sys.stdin.readline()
     if not line:

@@ -354,6 +354,7 @@ def _report_chips(source, problems):
     print("at rest: %.2f g" % g)
     if not 0.9 < g < 1.1:
         problems.append("sensor: %.2f g; keep the board still, or calibrate" % g)
+    _report_self_test(imu, problems)
     if source.mag_fault:
         problems.append("magnetometer: %s. The attitude comes from six axes" % source.mag_fault)
     if mag is None:
@@ -369,6 +370,23 @@ def _report_chips(source, problems):
     if not _MICROTESLA[0] <= strength <= _MICROTESLA[1]:
         problems.append(
             "field: %d uT is not the earth's: move away from iron, calibrate" % strength
+        )
+
+
+def _report_self_test(imu, problems):
+    try:
+        passed, changes = imu.self_test()
+    except (OSError, ValueError) as why:
+        problems.append("self-test: %s" % why)
+        return
+    print(
+        "self-test: %s"
+        % ("passed" if passed else "failed" if passed is False else "the chip has no factory trims")
+    )
+    if passed is False:
+        problems.append(
+            "self-test: accel x y z, gyro x y z answer %s per mille off the factory's trim: a damaged chip, "
+            "or a copy with trims that mean nothing" % (changes,)
         )
 
 

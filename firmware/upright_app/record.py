@@ -1,5 +1,5 @@
-# Records raw counts into a file for `upright calibrate`: import record; record.run("tumble.imu", seconds=60)
-# Needs the files of lib/ and a board.py. Every port; takes the place of the application while it runs.
+# Records raw counts for `upright calibrate`; `upright record` brings it into the board's RAM and takes the rows.
+# Needs upright/settings.py and a board.py. Every port; takes the place of the application while it runs.
 
 import json
 import os
@@ -15,12 +15,13 @@ _SPARE = const(8192)  # bytes of the file system that are left alone
 _SILENT_US = const(2000000)
 
 
-def run(path="recording.imu", seconds=60, rate_hz=100, board=None):
+def run(path="recording.imu", seconds=60, rate_hz=100, board=None, file=None):
     """Write the counts of `seconds` to `path`, in the chips' own frames; Ctrl-C ends it earlier.
 
     rate_hz  of the chip, and of the rows; 100 Hz is what a board's flash takes. Rows that were
              missed while the flash was being written are in the file as not fresh.
     board    the board's module; None: board.py
+    file     what to write to (write, seek) in place of a file of that name
 
     Returns the number of rows. Raises the driver's error when there is no sensor, OSError when the
     file cannot be written or is too large for the file system.
@@ -31,27 +32,35 @@ def run(path="recording.imu", seconds=60, rate_hz=100, board=None):
     imu, mag = _open(board, rate_hz)
     num, den = imu.sample_rate
     rows = max(1, seconds * num // den)
-    free = _free(path)
+    free = _free(path) if file is None else None
     if free is not None and rows * 2 * _WORDS > free:
         raise OSError(
             "%d s take %d bytes, %d are free: fewer seconds, or a lower rate_hz"
             % (seconds, rows * 2 * _WORDS, free)
         )
     print("recording %d s at %d/%d Hz; Ctrl-C ends it" % (seconds, num, den))
+    header = _header(board, imu, mag, path)
+    if file is not None:
+        return _record(path, file, header, imu, mag, rows)
     with open(path, "wb") as file:
-        recorder = _Recorder(file, _header(board, imu, mag, path), rows)
-        try:
-            recorder.record(imu, mag, num, den)
-            print("done")
-        except KeyboardInterrupt:
-            print("ended")
-        finally:
-            recorder.finish()
-    n = recorder.n
-    print("%s: %d rows, %d of them missed" % (path, n, recorder.lost))
+        n = _record(path, file, header, imu, mag, rows)
     print("fetch it:  mpremote cp :%s ." % path)
     print("then:      upright calibrate mag (or gyro, accel) %s" % path[path.rfind("/") + 1 :])
     return n
+
+
+def _record(path, file, header, imu, mag, rows):
+    recorder = _Recorder(file, header, rows)
+    num, den = imu.sample_rate
+    try:
+        recorder.record(imu, mag, num, den)
+        print("done")
+    except KeyboardInterrupt:
+        print("ended")
+    finally:
+        recorder.finish()
+    print("%s: %d rows, %d of them missed" % (path, recorder.n, recorder.lost))
+    return recorder.n
 
 
 class _Recorder:

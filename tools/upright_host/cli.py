@@ -20,6 +20,7 @@ from upright_host import (
     options,
     packages,
     paths,
+    record,
     replay,
     rp2040,
     runtimes,
@@ -51,7 +52,20 @@ def main_options(
     """Attitude (roll, pitch, yaw) for MicroPython: install, examine, simulate, replay, score."""
 
 
-for module in (flash, doctor, dmp, calibrate, replay, score, compare, demo, tune, bench, packages):
+for module in (
+    flash,
+    doctor,
+    record,
+    dmp,
+    calibrate,
+    replay,
+    score,
+    compare,
+    demo,
+    tune,
+    bench,
+    packages,
+):
     module.register(app)
 
 

@@ -37,7 +37,7 @@ def board_files(
     own: the text of programs of the user's, which stay on the board; what they need is installed as well.
     everything: all modules, needed or not.
     """
-    files = {"board.py": board_file(board).read_bytes()}
+    files = {"board.py": (paths.BOARDS / paths.known_board(board) / "board.py").read_bytes()}
     for path in sorted(paths.FIRMWARE.glob("*.py")):
         files[path.name] = path.read_bytes()
     if facts.frozen:
@@ -53,15 +53,6 @@ def board_files(
         else:
             files[f"{name}.py"] = path.read_bytes()
     return files
-
-
-def board_file(board: str) -> Path:
-    """The board.py of a board of boards/. Raises device.DeviceError with those that there are."""
-    path = paths.BOARDS / board / "board.py"
-    if not path.exists():
-        known = ", ".join(sorted(p.parent.name for p in paths.BOARDS.glob("*/board.py")))
-        raise device.DeviceError(f"unknown board {board!r}; there are {known}")
-    return path
 
 
 def library(text: str) -> set[str]:
@@ -80,10 +71,18 @@ def library(text: str) -> set[str]:
     for path in [*paths.FIRMWARE.glob("*.py"), *paths.APPLICATION.glob("*.py")]:
         if path.stem not in ON_DEMAND:
             found |= packages.imports(ast.parse(path.read_text()))
-    wanted = sorted(found)
+    return with_imports(found)
+
+
+def with_imports(names: set[str], late: bool = True) -> set[str]:
+    """Modules of lib/upright and, in turn, what they import; without what is only called by hand.
+
+    late: also what a function of theirs imports.
+    """
+    found, wanted = {*names}, sorted(names)
     while wanted:
         tree = ast.parse((paths.PACKAGE / f"{wanted.pop()}.py").read_text())
-        new = packages.imports(tree) - found - {*BY_HAND}
+        new = packages.imports(tree, late) - found - {*BY_HAND}
         found |= new
         wanted += sorted(new)
     return found
@@ -99,7 +98,7 @@ def setting(text: str, name: str):
 
 def platform(board: str) -> str | None:
     """The MicroPython port that a board's board.py is for (its PLATFORM), None when it says nothing."""
-    return setting(board_file(board).read_text(), "PLATFORM")
+    return setting((paths.BOARDS / board / "board.py").read_text(), "PLATFORM")
 
 
 # ------------------------------------------------------------------------------------------ compiling

@@ -4,8 +4,11 @@ Stands on mpremote's transports; whatever has their interface will do (the emula
 """
 
 import ast
+import contextlib
 import time
 from dataclasses import dataclass
+
+from upright_host.console import Failed
 
 LEAST_VERSION = (1, 22)
 # sys.implementation._mpy >> 10 & 15 (MicroPython's docs, reference/mpyfiles; flags of the architecture stand above)
@@ -39,7 +42,7 @@ print(repr((sys.platform, getattr(sys.implementation, '_machine', ''), tuple(sys
 """
 
 
-class DeviceError(RuntimeError):
+class DeviceError(Failed):
     """No board, another board than was asked for, or one that cannot do what is needed; says what to do."""
 
 
@@ -117,15 +120,23 @@ def connect(port: str):
     return transport
 
 
-def open_board(port: str | None, emulated: bool = False):
+@contextlib.contextmanager
+def opened(port: str | None, emulated: bool = False):
     """A transport to the emulated Pico, or to the board on a port: this one, or the only one. Raises DeviceError."""
-    return _emulated() if emulated else connect(pick_port(port))
+    from mpremote.transport import TransportError
 
+    if emulated:
+        from upright_host import emulated as pico
 
-def _emulated():
-    from upright_host import emulated
-
-    return emulated.connect()
+        transport = pico.connect()
+    else:
+        transport = connect(pick_port(port))
+    try:
+        yield transport
+    except TransportError as why:
+        raise DeviceError(str(why)) from None
+    finally:
+        transport.close()
 
 
 def facts(transport) -> Facts:

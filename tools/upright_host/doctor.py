@@ -1,15 +1,14 @@
 """`upright doctor`: what a board says of itself, its chips, its timer and its axis maps, and what to do about it.
 
-The examination runs on the board, upright_app/doctor.py; here are only its beginning and its end.
+The examination runs on the board, upright_app/doctor.py, from its RAM; here are only its beginning and its end.
 """
 
 import ast
 
 import typer
-from mpremote.transport import TransportError
-from rich.console import Console
 
-from upright_host import contents, device, paths, runtimes, simulate
+from upright_host import contents, device, paths, ram, simulate
+from upright_host.console import FAILED, Wrong, say
 
 DOCTOR = paths.SIMULATOR / "run_doctor.py"
 _MARK = "\x1e"  # before the list of problems, which no console line begins with
@@ -18,7 +17,7 @@ _MARK = "\x1e"  # before the list of problems, which no console line begins with
 def examine(transport, axes: bool, south: bool, on_line) -> list[str]:
     """Examine a connected board -> its problems. axes: with the guided check of IMU_AXES and MAG_AXES.
 
-    Raises device.DeviceError when the firmware is not on it.
+    Raises device.DeviceError when there is no board.py on it.
     """
     found = device.facts(transport)
     problems = found.problems()
@@ -26,31 +25,36 @@ def examine(transport, axes: bool, south: bool, on_line) -> list[str]:
     on_line(
         f"{found.machine or found.platform}: MicroPython {version}, {found.free_bytes} bytes of file system free"
     )
-    for name in ("board.py", "lib/upright_app/doctor.mpy"):
-        if not transport.fs_exists(name) and not transport.fs_exists(name.replace(".mpy", ".py")):
-            raise device.DeviceError(f"{name} is not on the board: `upright flash BOARD` first")
+    ram.load(transport, found, "doctor", "axis_check")
     wanted = contents.setting(transport.fs_readfile("board.py").decode(), "PLATFORM")
     if wanted and wanted != found.platform:
         problems.append(f"board.py is for the port {wanted!r}, this is {found.platform!r}")
     call = f"doctor.axes(board, {south})" if axes else "doctor.report(board)"
-    rest = ""
     said = []
-
-    def consume(data: bytes):
-        nonlocal rest
-        rest += data.replace(b"\x04", b"").decode("utf-8", "replace")
-        *lines, rest = rest.split("\n")
-        for line in lines:
-            if line.startswith(_MARK):
-                said.append(ast.literal_eval(line[1:]))
-            else:
-                on_line(line.rstrip("\r"))
-
+    lines = Lines({_MARK: lambda line: said.append(ast.literal_eval(line))}, on_line)
     transport.exec(
-        f"import board\nfrom upright_app import doctor\nprint({_MARK!r} + repr({call}))",
-        data_consumer=consume,
+        f"import board\nfrom upright_app import doctor\nRam.files.clear()\nprint({_MARK!r} + repr({call}))",
+        data_consumer=lines.feed,
     )
     return problems + (said[0] if said else ["the examination did not end"])
+
+
+class Lines:
+    """Takes what a board prints, in whatever pieces, apart into lines. marked: {first character: called with the rest
+    of such a line}; on_line is called with the others."""
+
+    def __init__(self, marked: dict, on_line):
+        self._marked, self._on_line, self._rest = marked, on_line, ""
+
+    def feed(self, data: bytes):
+        self._rest += data.replace(b"\x04", b"").decode("utf-8", "replace")
+        *lines, self._rest = self._rest.split("\n")
+        for line in lines:
+            line = line.rstrip("\r")
+            if line[:1] in self._marked:
+                self._marked[line[:1]](line[1:])
+            else:
+                self._on_line(line)
 
 
 def examine_simulated(board: str, runtime: str, on_line, **parts) -> list[str]:
@@ -83,29 +87,12 @@ def register(app: typer.Typer):
             False, help="Examine the emulated Pico (`upright flash pico --emulated` before)."
         ),
     ):
-        """Examine a board with the firmware on it: chips, rates, timer, heap, axis maps; and what to fix."""
-        console = Console()
-
-        def say(line):
-            console.print(line, highlight=False, markup=False)
-
-        try:
-            if axes and (simulated or emulated):
-                raise device.DeviceError("nobody turns a simulated board: --axes needs a real one")
-            if simulated:
-                problems = examine_simulated(simulated, simulate.best_runtime(), say)
-            else:
-                transport = device.open_board(port, emulated)
-                try:
-                    problems = examine(transport, axes, south, say)
-                finally:
-                    transport.close()
-        except (
-            device.DeviceError,
-            TransportError,
-            simulate.SimulationError,
-            runtimes.Unavailable,
-        ) as why:
-            console.print(str(why), style="red", highlight=False, markup=False)
-            raise typer.Exit(1) from None
-        raise typer.Exit(1 if problems else 0)
+        """Examine a board: self-test, chips, rates, timer, heap, axis maps; and what to fix."""
+        if axes and (simulated or emulated):
+            raise Wrong("nobody turns a simulated board: --axes needs a real one")
+        if simulated:
+            problems = examine_simulated(simulated, simulate.best_runtime(), say)
+        else:
+            with device.opened(port, emulated) as transport:
+                problems = examine(transport, axes, south, say)
+        raise typer.Exit(FAILED if problems else 0)

@@ -15,11 +15,10 @@ from dataclasses import dataclass, field
 from pathlib import PurePosixPath
 
 import typer
-from mpremote.transport import TransportError, TransportExecError
-from rich.console import Console
-from rich.progress import Progress
+from mpremote.transport import TransportExecError
 
-from upright_host import __version__, contents, device, paths, runtimes
+from upright_host import __version__, contents, device, options, paths
+from upright_host.console import Wrong, progress, say
 
 RECORD = "upright.json"  # on the board: what was installed, {"version": , "files": {name: sha256}}
 STAGE, SELF = "upright.new", "upright.py"  # as in upright_app/installation.py
@@ -392,14 +391,8 @@ def look(transport, names: list[str]) -> dict[str, tuple[str | None, int]]:
 # ------------------------------------------------------------------------------------------ the command
 
 
-def run(
-    transport, board: str, source: bool, force: bool, console, everything: bool = False
-) -> bool:
+def run(transport, board: str, source: bool, force: bool, everything: bool = False) -> bool:
     """Install on a connected board, with progress -> whether anything was changed. Raises device.DeviceError."""
-
-    def say(text):
-        console.print(text, highlight=False, markup=False)
-
     found = device.facts(transport)
     version = ".".join(map(str, found.version))
     say(f"{found.machine or found.platform}: MicroPython {version}, {found.architecture}")
@@ -425,15 +418,8 @@ def run(
     )
     if not (steps.install or steps.remove or steps.blocked or steps.backup):
         return False
-    with Progress(console=console) as progress:
-        task = progress.add_task("copying", total=None)
-        staged = execute(
-            transport,
-            steps,
-            lambda name, done, total: progress.update(
-                task, completed=done, total=total, description=name
-            ),
-        )
+    with progress("copying") as at:
+        staged = execute(transport, steps, lambda name, done, total: at(done, total, name))
     say("verified by hash and put in place")
     if not staged:
         say("(in the place of the old files, since there was no room beside them)")
@@ -469,31 +455,20 @@ def register(app: typer.Typer):
         force: bool = typer.Option(
             False, help="Replace files of your own that are in the way; a copy stays as NAME.bak."
         ),
-        seconds: float = typer.Option(
-            None,
-            help="Show what the board says after its restart for so long (default: 5, emulated 2).",
+        seconds: float = options.seconds(
+            "Show what the board says after its restart for so long (default: 5, emulated 2)."
         ),
         emulated: bool = typer.Option(
             False, help="Install on an emulated Pico, whose flash is kept between the runs."
         ),
     ):
         """Install the firmware on a board over USB: compiled for it, only what changed, verified, never half."""
-        console = Console()
-        try:
-            contents.board_file(board)
-            if emulated and board != "pico":
-                raise device.DeviceError(f"the emulated board is a Pico, not {board}")
-            transport = device.open_board(port, emulated)
-            try:
-                run(transport, board, source, force, console, everything)
-                console.print("restarting:")
-                device.restart(
-                    transport,
-                    seconds or (2 if emulated else 5),
-                    lambda line: console.print("  " + line, highlight=False, markup=False),
-                )
-            finally:
-                transport.close()
-        except (device.DeviceError, TransportError, runtimes.Unavailable) as why:
-            console.print(str(why), style="red", highlight=False, markup=False)
-            raise typer.Exit(1) from None
+        paths.known_board(board)
+        if emulated and board != "pico":
+            raise Wrong(f"the emulated board is a Pico, not {board}")
+        with device.opened(port, emulated) as transport:
+            run(transport, board, source, force, everything)
+            say("restarting:")
+            device.restart(
+                transport, seconds or (2 if emulated else 5), lambda line: say("  " + line)
+            )

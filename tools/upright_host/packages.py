@@ -52,10 +52,10 @@ def modules(name: str) -> list[str]:
     return sorted(found)
 
 
-def imports(tree: ast.AST) -> set[str]:
-    """The modules of lib/ that a file imports, at its top or inside a function."""
+def imports(tree: ast.Module, late: bool = True) -> set[str]:
+    """The modules of lib/upright that a file imports; late: also those that a function of it imports."""
     found = set()
-    for node in ast.walk(tree):
+    for node in ast.walk(tree) if late else tree.body:
         if isinstance(node, ast.ImportFrom) and node.module == "upright":
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("upright."):
