@@ -1,7 +1,7 @@
 """`upright doctor` and `upright record`: on a simulated board, and from the RAM of one."""
 
 import pytest
-from conftest import require
+from conftest import some_micropython
 from typer.testing import CliRunner
 from unix_board import UnixBoard
 from upright_host import cli, console, device, doctor, paths, ram, record, recordings
@@ -50,7 +50,7 @@ def sensor():
 @pytest.fixture
 def unix(tmp_path):
     """unix(files) -> a board with these files, which has to end up with these files and no others."""
-    require("unix")
+    some_micropython()
     made = []
     folder = tmp_path / "flash"
     folder.mkdir()

@@ -24,28 +24,33 @@ def test_every_module_is_in_a_package_and_every_version_is_the_projects():
     named = set()
     for path in packages.package_files():
         package = json.loads(path.read_text())
+        assert [at for at, _ in package["urls"] if "__init__" in at] == ["upright/__init__.py"]
         assert package["version"] == __version__
         named |= {url.rpartition("/")[2] for _, url in package["urls"]}
         for _, url in package["urls"]:
             assert (path.parent / url).exists()
     assert named == {path.name for path in paths.PACKAGE.glob("*.py")}
+    whole = [json.loads((p / "package.json").read_text()) for p in (paths.ROOT, paths.PACKAGE)]
+    for package in whole:
+        assert {at for at, _ in package["urls"]} == {f"upright/{name}" for name in named}
 
 
 @pytest.mark.parametrize("name", packages.names())
-def test_a_package_can_be_imported_with_nothing_else_there(name, tmp_path):
+def test_a_module_can_be_imported_with_its_package_alone(name, tmp_path):
     start, _ = runtimes.interpreter(some_micropython())
-    for module in packages.modules(name):
-        (tmp_path / "upright").mkdir(exist_ok=True)
-        shutil.copy(paths.PACKAGE / f"{module}.py", tmp_path / "upright")
-    for module in packages.modules(name):
-        done = subprocess.run(
-            [*start, "-c", f"import upright.{module}"],
-            cwd=tmp_path,
-            env={"MICROPYPATH": str(tmp_path)},
-            capture_output=True,
-            text=True,
-        )
-        assert done.returncode == 0, f"{module} of {name}: {done.stderr}"
+    (tmp_path / "upright").mkdir()
+    package = json.loads((paths.PACKAGE / f"{name}.json").read_text())
+    for place, source in package["urls"]:
+        shutil.copy(paths.PACKAGE / source, tmp_path / place)
+    assert (tmp_path / "upright" / "__init__.py").exists()
+    done = subprocess.run(
+        [*start, "-c", f"import upright.{name}"],
+        cwd=tmp_path,
+        env={"MICROPYPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
 
 
 def test_the_mpu6500_comes_with_its_magnetometer():
@@ -94,4 +99,5 @@ def test_mip_installs_a_package_file_of_a_clone(tmp_path):
         mip._install_package(board, str(paths.PACKAGE / "calibration.json"), "", "lib", None, True)
     finally:
         board.close()
-    assert [path.name for path in (tmp_path / "lib" / "upright").iterdir()] == ["calibration.py"]
+    names = {path.stem for path in (tmp_path / "lib" / "upright").iterdir()}
+    assert names == {*packages.modules("calibration")}

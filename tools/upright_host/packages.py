@@ -1,7 +1,8 @@
-"""Packages for mip: one for each module of lib/ with what it imports, one for all; and an index of them to serve.
+"""Packages for mip: one for each module of lib/upright with what it imports, one for all; and an index to serve.
 
 A package is a JSON file beside the modules (lib/upright/mpu6500.json), so that `mpremote mip install` takes it from a
-clone, or from wherever the repository is published, without an index. The version is the project's, for all of them.
+clone, or from wherever the repository is published, without an index: github:ORG/REPO/lib/upright/mpu6500.json for one
+module, github:ORG/REPO for all. The version is the project's, for all of them.
 """
 
 import ast
@@ -15,40 +16,33 @@ import typer
 
 from upright_host import __version__, paths, runtimes
 
-# What a user asks for by name: the module that is imported, and what belongs beside it without being imported by it.
-_TOGETHER = {"mpu6500": ("ist8310",), "ist8310": ("mpu6500",), "dmp": ("mpu6050",)}
-# What serves other modules only
-_INNER = (
-    *(
-        "attitude",
-        "fixmath",
-        "registers",
-        "mpu_common",
-        "mpu_parts",
-        "mpu_setup",
-        "mpu_selftest",
-        "inertial_kernels",
-    ),
-    *("euler_kernels", "quaternion_kernels", "dmp_image", "dmp_setup"),
-    *("canvas", "font"),
-)
+# What belongs beside a module without being imported by it: an MPU6500 mostly has an IST8310 behind it, a DMP is in a
+# chip, and the registry of the filters imports the default by its name.
+_TOGETHER = {
+    "mpu6500": ("ist8310",),
+    "ist8310": ("mpu6500",),
+    "dmp": ("mpu6050",),
+    "filters": ("inertial",),
+}
 INDEX_FORMAT = 1
 MPY_VERSION = 6  # of .mpy files, sys.implementation._mpy & 0xff: MicroPython 1.19 and newer
 
 
 def names() -> list[str]:
     """Every package but the whole."""
-    return sorted(path.stem for path in paths.PACKAGE.glob("*.py") if path.stem not in _INNER)
+    return sorted(path.stem for path in paths.PACKAGE.glob("*.py") if path.stem != "__init__")
 
 
 def modules(name: str) -> list[str]:
-    """The modules of lib/ that a package consists of, sorted: its own and, in turn, what these import."""
-    wanted, found = [name, *_TOGETHER.get(name, ())], set()
+    """The modules of lib/upright that a package consists of, sorted: its own and, in turn, what these import; and
+    __init__, whose functions want the whole."""
+    wanted, found = [name], {"__init__"}
     while wanted:
         module = wanted.pop()
         if module not in found:
             found.add(module)
             wanted += imports(ast.parse((paths.PACKAGE / f"{module}.py").read_text()))
+            wanted += _TOGETHER.get(module, ())
     return sorted(found)
 
 
@@ -70,9 +64,11 @@ def package_files() -> dict[Path, str]:
         urls = [[f"upright/{module}.py", f"{module}.py"] for module in modules(name)]
         files[paths.PACKAGE / f"{name}.json"] = _package(urls)
     every = sorted(path.name for path in paths.PACKAGE.glob("*.py"))
-    files[paths.ROOT / "package.json"] = _package(
-        [[f"upright/{name}", f"lib/upright/{name}"] for name in every]
-    )
+    for folder in (paths.ROOT, paths.PACKAGE):
+        here = "" if folder == paths.PACKAGE else "lib/upright/"
+        files[folder / "package.json"] = _package(
+            [[f"upright/{module}", f"{here}{module}"] for module in every]
+        )
     return files
 
 
@@ -138,7 +134,7 @@ def register(app: typer.Typer):
             False, help="Only say whether the package files are as they should be."
         ),
     ):
-        """Write the package files of lib/ (package.json, lib/upright/*.json), or an index to serve."""
+        """Write the package files (package.json, lib/upright/*.json), or an index to serve."""
         if index:
             print(f"{index}: {', '.join(write_index(index))}")
             return
