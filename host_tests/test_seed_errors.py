@@ -4,6 +4,7 @@ The formulas are stated anew here, in Python floats. What a test measures it the
 English and Chinese, so that no figure there can be another than the one measured.
 """
 
+import functools
 import math
 import re
 
@@ -445,46 +446,36 @@ def rates_zxy(roll, pitch, w):
     )
 
 
+def off_after(rates, order):
+    """Degrees off after 1 s at 30 deg/s about each axis, from roll 30, pitch 40; order: pitch's axis, then roll's."""
+    of_pitch, of_roll = order
+    w = np.full(3, 30 * DEGREE)
+    start = product(about(of_pitch, 40), about(of_roll, 30))
+    true = fed(made(kp=0, q=start), 1, dps=(30, 30, 30)).q
+    angles = np.array([30, 40, 0]) * DEGREE
+    for _ in range(2000):
+        middle = angles + rates(angles[0], angles[1], w) / 4000
+        angles = angles + rates(middle[0], middle[1], w) / 2000
+    roll, pitch, yaw = angles / DEGREE
+    return angle_between(
+        product(about("z", yaw), about(of_pitch, pitch), about(of_roll, roll)), true
+    )
+
+
 def test_22_the_kinematics_have_an_inverse_and_a_cosine_too_many():
     """From roll 30, pitch 40 for 1 s at 30 deg/s about each axis."""
+    assert off_after(rates_right, "yx") < 1e-3
     w = np.full(3, 30 * DEGREE)
-    start = product(about("y", 40), about("x", 30))
-    true = fed(made(kp=0, q=start), 1, dps=(30, 30, 30)).q
-
-    def after(rates):
-        angles = np.array([30, 40, 0]) * DEGREE
-        for _ in range(2000):
-            middle = angles + rates(angles[0], angles[1], w) / 4000
-            angles = angles + rates(middle[0], middle[1], w) / 2000
-        roll, pitch, yaw = angles / DEGREE
-        return angle_between(product(about("z", yaw), about("y", pitch), about("x", roll)), true)
-
-    assert after(rates_right) < 1e-3
     same = rates_printed(0.3, 0.4, w, inverse=False, extra=False)
     assert same == pytest.approx(rates_right(0.3, 0.4, w))
-    stated(
-        22,
-        f"{after(rates_printed):.0f}",
-        f"{after(lambda a, b, w: rates_printed(a, b, w, inverse=False)):.0f}",
-    )
+    without_inverse = functools.partial(rates_printed, inverse=False)
+    stated(22, f"{off_after(rates_printed, 'yx'):.0f}", f"{off_after(without_inverse, 'yx'):.0f}")
 
 
 def test_23_matrix_and_kinematics_are_of_two_orders():
     """The kinematics that go with the text's matrix are others: the same second with those of zyx in the order zxy."""
-    w = np.full(3, 30 * DEGREE)
-    start = product(about("x", 40), about("y", 30))
-    true = fed(made(kp=0, q=start), 1, dps=(30, 30, 30)).q
-
-    def after(rates):
-        angles = np.array([30, 40, 0]) * DEGREE
-        for _ in range(2000):
-            middle = angles + rates(angles[0], angles[1], w) / 4000
-            angles = angles + rates(middle[0], middle[1], w) / 2000
-        roll, pitch, yaw = angles / DEGREE
-        return angle_between(product(about("z", yaw), about("x", pitch), about("y", roll)), true)
-
-    assert after(rates_zxy) < 1e-3
-    stated(23, f"{after(rates_right):.0f}")
+    assert off_after(rates_zxy, "xy") < 1e-3
+    stated(23, f"{off_after(rates_right, 'xy'):.0f}")
 
 
 def test_24_the_same_angles_in_another_order_are_another_attitude():

@@ -44,6 +44,9 @@ def main():
     if seconds != "-":
         kernel.stop_at(int(float(seconds) * 1000000))
     sys.argv[:] = sys.argv[3:]
+    sys.path.insert(
+        0, path.rsplit("/", 1)[0]
+    )  # what lies beside it, as a board's root would hold it
     with open(path) as file:
         code = compile(file.read(), path, "exec")
     try:
