@@ -84,9 +84,11 @@ def _matrix_lines(title: str, matrix: np.ndarray) -> list[str]:
 
 
 # ---------------------------------------------------------------------------------------- commands
+# what a board looks for
+_DEFAULT = Path(library.upright("settings").DEFAULTS["CALIBRATION"])
 _FILE = typer.Argument(..., help="A recording: .imu, a trial .npz, or .csv of counts.")
 _OUT = typer.Option(
-    Path("calibration.json"),
+    _DEFAULT,
     callback=options.writable,
     help="The calibration file to write or update.",
 )
@@ -194,7 +196,7 @@ def register(app: typer.Typer) -> None:
 
     @commands.command("show")
     def show(
-        file: Path = typer.Argument(Path("calibration.json"), help="A calibration file."),
+        file: Path = typer.Argument(_DEFAULT, help="A calibration file."),
         chip: str = typer.Option(None, help="Is it for this IMU?"),
         board: str = typer.Option(None, help="Is it for this board?"),
     ):
