@@ -3,6 +3,7 @@
 import json
 from array import array
 
+import numpy as np
 import pytest
 import world
 from hypothesis import given, settings
@@ -189,3 +190,21 @@ def test_data_that_are_not_whole_rows_are_not_written(tmp_path):
     assert not (tmp_path / "x.imu").exists()
     with pytest.raises(ValueError, match="not positive"):
         world.StillWorld(rate=(0, 1))
+
+
+def test_a_board_at_rest_has_a_sensors_noise_the_same_each_time():
+    still = world.NoisyWorld()
+    rows = np.array([list(still.row(k)) for k in range(4000)])
+    level = np.array([*world.LEVEL, 0])
+    assert abs(rows.mean(0) - level).max() < 1
+    noise = rows.std(0)
+    assert noise[:3] == pytest.approx(16.4, rel=0.05)  # 4 mg
+    assert noise[3:6] == pytest.approx(0.87, rel=0.05)  # 0.05 deg/s
+    assert noise[6:9] == pytest.approx(1.1, rel=0.05)
+    assert not noise[9:].any()
+    together = np.corrcoef(np.hstack([rows[1:, :9], rows[:-1, :9]]).T) - np.eye(18)
+    assert abs(together).max() < 0.1
+    again = world.NoisyWorld()
+    out = array("h", [0] * 11)
+    again.load(1234, out)
+    assert list(out) == rows[1234].tolist()
