@@ -27,6 +27,7 @@ class ChipBus:
         self.chip = chip
         self.sent = 0  # data bytes, without control bytes
         self.longest = 0
+        self.first_light = None  # what was seen when it was lit for the first time
 
     def writeto(self, address, data):
         chip = self.chip
@@ -41,6 +42,8 @@ class ChipBus:
                     raise OSError(5)
         finally:
             chip.i2c_stop(0)
+        if chip.lit and self.first_light is None:
+            self.first_light = chip.frame()
 
 
 def bench(panel="SSD1306 128x64", begin=True, chip_address=0x3C, **options):
@@ -306,8 +309,8 @@ PANELS = {
 @pytest.mark.parametrize("options", [{}, {"rotate": 180}, {"chunk": 128}, {"chunk": 8}], ids=str)
 @pytest.mark.parametrize("panel", PANELS)
 def test_every_panel_shows_the_buffer(panel, options):
-    chip, _bus, d = bench(panel, **options)
-    assert chip.lit and not chip.dim and not any(chip.frame()), "cleared before it was lit"
+    chip, bus, d = bench(panel, **options)
+    assert chip.lit and not chip.dim and not any(bus.first_light), "cleared before it was lit"
     buffer = drawn(d)
     seen = chip.picture()
     if "rotate" in options:
@@ -357,7 +360,9 @@ def test_spi_through_the_machine_with_and_without_reset_and_chip_select(panel, h
     machine.wire_spi(1, chip, **wires)
     pins = {name: machine.Pin(n, machine.Pin.OUT) for name, n in wires.items()}
     d = ssd1306.SSD1306(machine.SPI(1, baudrate=hz), panel, **pins)
+    chip.page_range = [1, 2]  # no command of the set-up changes that
     d.begin()
+    assert (chip.page_range == [0, 7]) == ("rst" in wires)
     assert drawn(d) == chip.picture() and chip.lit and chip.errors == []
 
 
@@ -576,6 +581,11 @@ def test_failures_are_counted_and_the_frame_given_up_at_last():
     assert [d.flush_step(32) for _ in range(3)] == [left] * 3, "sent again, not skipped"
     assert (d.errors, d.dropped, d.lost) == (3, 0, False)
     assert d.flush() and chip.picture() == rows(d)
+    d.contrast(9)
+    d.show()
+    whole = d.flush_step(8) + 8
+    chip.nack_next()
+    assert d.flush_step(8) == whole and d.flush(), "the set-up from its start"
     chip.vanish()
     d.fill(0)
     d.show()
@@ -583,9 +593,9 @@ def test_failures_are_counted_and_the_frame_given_up_at_last():
     while d.flush_step(32):
         calls += 1
     assert calls == 7 and not d.busy
-    assert (d.errors, d.dropped, d.lost) == (11, 1, True)
+    assert (d.errors, d.dropped, d.lost) == (12, 1, True)
     d.show()
-    assert d.flush_step(32) == 0 and d.errors == 12, "one attempt a frame while it is away"
+    assert d.flush_step(32) == 0 and d.errors == 13, "one attempt a frame while it is away"
 
 
 def test_a_short_loss_of_power_between_frames_heals():
