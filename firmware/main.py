@@ -2,8 +2,7 @@
 
 import upright  # noqa: F401, I001  first: it finishes an installation that was cut off
 
-import board
 from upright_app import app
 
-application = app.App(board)
+application = app.App()
 application.run()

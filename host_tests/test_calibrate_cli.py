@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import world
 from chips.mpu6050 import MPU6050Chip
-from upright import calibration
+from upright import ahrs, calibration
 from upright.mpu6050 import MPU6050
 from upright_app import record
 from upright_host import mag_fit, paths, recordings, rest_fit
@@ -651,18 +651,18 @@ def test_a_recording_that_does_not_fit_is_not_begun(tmp_path, board, monkeypatch
     assert not (tmp_path / "r.imu").exists()
 
 
-def test_an_application_that_still_ticks_is_stopped(tmp_path, board, monkeypatch):
-    import __main__
-
+def test_a_program_that_still_ticks_is_stopped(tmp_path, board, monkeypatch):
     stopped = []
 
-    def ticker(name):
-        return SimpleNamespace(stop=lambda: stopped.append(name))
+    class Left:
+        def stop(self):
+            stopped.append(self)
+            ahrs.running.remove(self)
 
-    application = SimpleNamespace(ticker=ticker("ticker"), guard=ticker("guard"))
-    monkeypatch.setattr(__main__, "application", application, raising=False)
+    left = [Left(), Left()]
+    monkeypatch.setattr(ahrs, "running", list(left))
     record.run(str(tmp_path / "r.imu"), 1, board=board(tmp_path / "world.imu", resting()))
-    assert stopped == ["ticker", "guard"]
+    assert stopped == left
 
 
 def test_it_records_the_same_on_every_runtime(runtime, portable, run, tmp_path, out):

@@ -258,9 +258,19 @@ def test_a_setting_with_a_slip_of_the_pen_is_refused(boot):
     "settings, said",
     [
         ({"RATE": 700}, "cannot tick at"),
-        ({"DRIVE": "telepathy"}, "DRIVE"),
+        ({"DRIVE": "telepathy"}, 'DRIVE is .telepathy., expected "timer"'),
+        ({"EULER": "xyz"}, "EULER is 'xyz'"),
+        ({"IMU_AXES": ["x", "x", "z"]}, "imu_axes are"),
+        ({"RATE": 500, "DRIVE": "fifo"}, "FIFO_HZ 63"),
+        ({"SENSOR_RATE_HZ": 100}, "SENSOR_RATE_HZ is 100"),
+        ({"RATE": 1400, "DRIVE": "data_ready", "FILTER": "mahony6"}, "sample_rate_hz"),
+        (
+            {"RATE": 4000, "SENSOR_RATE_HZ": 8000, "DLPF": 0, "FILTER": "mahony6"},
+            "a step takes 4.. us .4.. of them the bus., RATE leaves 250",
+        ),
+        ({"EULER": "xyz", "PAGE_SECONDS": -1, "GAINS": 7}, "EULER.*PAGE_SECONDS"),  # all at once
         ({"FILTER": "magic"}, "unknown filter"),
-        ({"ACCEL_RANGE_G": 3}, "accel_range_g"),
+        ({"ACCEL_RANGE_G": 3}, "ACCEL_RANGE_G is 3, expected 2, 4, 8 or 16"),
         ({"GAINS": {"kp": 0.5}}, "kp"),  # of another filter than the default
         ({"FILTER": "mahony6", "GAINS": {"kp": 1000.0}}, "kp"),
         ({"RATE": 50}, "rate"),

@@ -19,7 +19,7 @@ def still(tmp_path_factory):
 
 
 def bias_of(flash):
-    fields = calibration.read(str(flash / "calibration.json"))
+    fields = calibration.read(str(flash / "upright_cal.json"))
     return [v / 1e6 for v in fields["gyro_bias_udps"]]
 
 
@@ -30,11 +30,11 @@ def test_at_rest_it_is_kept_once_and_used_at_the_next_start(boot_board, still, t
     run = boot_board(world=str(still), seconds=22, board=board, flash=flash)
     assert run.result["crashes"] == run.result["missed"] == 0
     assert [line for line in run.lines if line.startswith("bias:")] == [
-        "bias: kept in calibration.json"
+        "bias: kept in upright_cal.json"
     ]
     assert bias_of(flash) == pytest.approx([1.2, -0.8, 0.6], abs=0.05)
     again = boot_board(world=str(still), seconds=16, board=board, flash=flash)
-    assert "bias: from calibration.json" in again.lines
+    assert "bias: from upright_cal.json" in again.lines
     assert again.result["bias_known"]
     assert not any("kept" in line for line in again.lines)  # it has not changed
     assert again.times[0] < run.times[0] + 100000
@@ -44,9 +44,9 @@ def test_the_rest_of_the_calibration_file_stays(boot_board, still, tmp_path):
     flash = tmp_path / "flash"
     flash.mkdir()
     accel = {"offset_ug": [100, 200, 300], "matrix_ppm": [10**6, 0, 0, 0, 10**6, 0, 0, 0, 10**6]}
-    calibration.write(str(flash / "calibration.json"), calibration.blank() | {"accel": accel})
+    calibration.write(str(flash / "upright_cal.json"), calibration.blank() | {"accel": accel})
     boot_board(world=str(still), seconds=16, board=INERTIAL | {"MEASURE_BIAS": False}, flash=flash)
-    fields = calibration.read(str(flash / "calibration.json"))
+    fields = calibration.read(str(flash / "upright_cal.json"))
     assert fields["accel"] == accel
     assert fields["gyro_bias_udps"] is not None
 

@@ -184,7 +184,7 @@ def test_sampling_slower_than_the_chip_would_lose_magnetometer_samples_and_is_re
 
 
 def write_calibration(flash, **sections):
-    calibration.write(str(flash / "calibration.json"), calibration.blank() | sections)
+    calibration.write(str(flash / "upright_cal.json"), calibration.blank() | sections)
 
 
 @pytest.fixture
@@ -212,7 +212,7 @@ def test_a_calibration_file_that_cannot_be_used_means_defaults_and_a_message(
     boot, tmp_path, content, said
 ):
     if content is not None:
-        (tmp_path / "calibration.json").write_text(content)
+        (tmp_path / "upright_cal.json").write_text(content)
     run = boot(flash=tmp_path)
     healthy(run.result)
     assert any(line.startswith("calibration:") and said in line for line in run.lines)
@@ -223,7 +223,7 @@ def test_a_calibration_that_cannot_be_used_is_named_on_the_display_too(boot, tmp
     pictures = []
     for content in ("{}", None):
         if content:
-            (tmp_path / "calibration.json").write_text(content)
+            (tmp_path / "upright_cal.json").write_text(content)
         else:
             write_calibration(tmp_path)
         run = boot(flash=tmp_path, seconds=1)
@@ -245,7 +245,7 @@ def test_hard_iron_turns_the_heading_until_it_is_calibrated_away(boot, iron, tmp
     )
     mended = boot(world=str(path), flash=tmp_path)
     healthy(mended.result)
-    assert "calibration: calibration.json" in mended.lines
+    assert "calibration: upright_cal.json" in mended.lines
     assert error((path, motion), spoilt).total > 10
     assert error((path, motion), mended).total < 1.5
 
@@ -259,4 +259,4 @@ def test_the_bias_of_the_file_is_used_when_the_board_never_rests(boot, tmp_path)
     run = boot(world=str(path), seconds=8, flash=tmp_path)
     healthy(run.result)
     assert run.result["bias_known"]
-    assert "bias: from calibration.json" in run.lines
+    assert "bias: from upright_cal.json" in run.lines

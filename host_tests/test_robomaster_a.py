@@ -200,9 +200,10 @@ def board():
 
 
 def test_board_py_is_one_that_the_firmware_takes(board):
-    from upright import settings as config
+    from upright.settings import Settings, of_board
 
-    settings = config.Config(board)
+    settings = Settings(of_board(board))
+    settings.check(9)
     assert (settings.RATE, settings.DRIVE, settings.FILTER) == ((1000, 1), "timer", None)
     assert not settings.DISPLAY_SHARES_BUS
     assert board.data_ready_pin() is not None
@@ -241,6 +242,7 @@ def test_the_tick_is_a_hard_timer_of_exactly_a_millisecond(board, monkeypatch):
         def callback(self, function):
             self.function = function
 
+    monkeypatch.setattr(timing, "_taken", [])
     monkeypatch.setattr(timing, "pyb", types.SimpleNamespace(Timer=Timer))
     ticker = board.make_tick((1000, 1), print)
     assert ticker.hard

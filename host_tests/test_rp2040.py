@@ -105,8 +105,8 @@ def flight(image, files, motion):
 def steps_and_fresh(board):
     """-> [steps, steps with a fresh sample] of one moment: the tick goes on."""
     return board.eval(
-        "(lambda out: application.tick.snapshot(out) and list(out)[5:])"
-        "(__import__('array').array('i', [0] * 7))"
+        "(lambda out: application.imu.snapshot(out) and list(out)[5:7])"
+        "(__import__('array').array('i', [0] * 15))"
     )
 
 
@@ -115,8 +115,8 @@ def landed(flight):
     """The same board, main.py interrupted: its timer still ticks. `numbers`: the application's counters."""
     flight.board.interrupt()
     flight.numbers = steps_and_fresh(flight.board) + flight.board.eval(
-        "[application.tick.missed, application.tick.crashes,"
-        " application.imu.errors, application.imu.resets, application.display.errors]"
+        "[application.imu.status()[name] for name in"
+        " ('missed', 'crashes', 'errors', 'resets', 'display_errors')]"
     )
     return flight
 
@@ -207,12 +207,13 @@ def test_the_displays_memory_is_what_cpythons_simulation_draws(landed, page):
         "    application._page = page\n"
         "    application._frame_at = time.ticks_add(time.ticks_ms(), -1000)\n"
         "    application.poll()\n"
-        "    while application.display.busy:\n"  # the tick writes it
+        "    while application.imu.display.busy:\n"  # the tick writes it
         "        time.sleep_ms(5)\n"
         f"draw({page})\n"
     )
     drawn = landed.board.eval(
-        "[list(application.angles), application.rate_hz, application.imu.temperature_cdeg(), application.faults()]"
+        "[list(application.angles), application.imu.rate_hz, application.imu.sensor.temperature_cdeg(),"
+        " application.imu.status()['faults']]"
     )
     angles, rate_hz, temperature, faults = drawn
     assert (rate_hz, faults) == (200, 0)
@@ -243,7 +244,7 @@ def test_a_float_in_the_tick_fails(landed):
         "class Floating:\n"
         "    def update(self, counts):\n"
         "        self.x = counts[0] * 1.5\n"
-        "tick = application.tick\n"
+        "tick = application.imu.tick\n"
         "whole, tick._filter = tick._filter, Floating()\n"
         "before = tick.crashes\n"
         "time.sleep_ms(52)\n"
@@ -265,11 +266,11 @@ def test_a_main_program_that_writes_the_shared_display_cuts(landed):
     before = landed.bus.cuts
     landed.board.exec(
         "for _ in range(2):\n"
-        "    application.display.fill(_)\n"
-        "    application.display.show()\n"
+        "    application.imu.display.fill(_)\n"
+        "    application.imu.display.show()\n"
         "    try:\n"
-        "        while application.display.busy:\n"
-        "            application.display.flush_step(32)\n"
+        "        while application.imu.display.busy:\n"
+        "            application.imu.display.flush_step(32)\n"
         "    except OSError:\n"
         "        pass\n"
     )
@@ -280,14 +281,14 @@ def test_ticks_that_are_kept_from_coming_are_missed(landed):
     """The failing twin of the steps' count."""
     missed = landed.board.exec(
         "import machine, time\n"
-        "before = application.tick.missed\n"
+        "before = application.imu.tick.missed\n"
         "state = machine.disable_irq()\n"
         "start = time.ticks_us()\n"
         "while time.ticks_diff(time.ticks_us(), start) < 23000:\n"
         "    pass\n"
         "machine.enable_irq(state)\n"
         "time.sleep_ms(20)\n"
-        "print(application.tick.missed - before)\n"
+        "print(application.imu.tick.missed - before)\n"
     )
     assert int(missed) >= 3
 
@@ -389,8 +390,8 @@ def attitude(board):
     """-> (quaternion as floats, world row of about now) of the running tick."""
     row = board.world.index(board.now_us - board.world.start_us)
     q = board.eval(
-        "(lambda out: application.tick.snapshot(out) and list(out))"
-        "(__import__('array').array('i', [0] * 7))"
+        "(lambda out: application.imu.snapshot(out) and list(out))"
+        "(__import__('array').array('i', [0] * 15))"
     )
     return np.array(q[:4]) / scoring.ONE, row
 
@@ -400,13 +401,13 @@ def test_nine_axes_over_spi_are_all_fresh(nine):
     assert "sensor: MPU6500" in console
     assert "magnetometer: IST8310" in console
     steps, fresh = steps_and_fresh(nine)
-    mag_fresh = nine.eval("application.mag.fresh")
+    mag_fresh = nine.eval("application.imu.magnetometer.fresh")
     assert fresh == steps
     assert abs(steps - NINE_S * 100) <= 6  # the prompt takes its time
     assert abs(mag_fresh - steps / 2) <= 8  # 50 Hz, and those before the first tick
     faults = nine.eval(
-        "(application.tick.missed, application.tick.crashes, application.imu.errors, application.imu.resets,"
-        " application.mag.stale, application.mag.errors, application.mag.resets, application.mag.saturated)"
+        "(lambda imu, mag: (imu.tick.missed, imu.tick.crashes, imu.sensor.errors, imu.sensor.resets, mag.stale,"
+        " mag.errors, mag.resets, mag.saturated))(application.imu, application.imu.magnetometer)"
     )
     assert not any(faults), faults
     assert nine.imu.misuse == nine.mag.misuse == []
@@ -434,14 +435,14 @@ def test_nine_axes_over_spi_give_the_true_attitude_with_its_heading(nine):
 def test_the_fifo_drive_in_a_hard_interrupt_loses_nothing(nine):
     said = nine.exec(
         "import time\n"
-        "application.ticker.stop()\n"
-        "application.config.DRIVE = 'fifo'\n"
-        "application._start_tick(application.imu.sample_rate)\n"
-        "fresh = application.mag.fresh\n"
+        "face = application.imu\n"
+        "face.settings.DRIVE = 'fifo'\n"
+        "face.start()\n"
+        "tick, imu, mag, ticker = face.tick, face.sensor, face.magnetometer, face.ticker\n"
+        "fresh = mag.fresh\n"
         "time.sleep_ms(500)\n"
-        "application.ticker.stop()\n"
-        "tick, imu, mag = application.tick, application.imu, application.mag\n"
-        "print(application.ticker.what, application.ticker.period_us, sep=',')\n"
+        "face.stop()\n"
+        "print(ticker.what, ticker.period_us, sep=',')\n"
         "print(tick.steps, tick.fresh, mag.fresh - fresh, tick.crashes, imu.errors, imu.resets, imu.fifo_overflows,"
         " imu.fifo_lost, mag.errors, mag.resets)\n"
     )

@@ -1,16 +1,19 @@
 """The tick: one step a sample whatever the timer does, faults counted and survived, a snapshot that is never torn."""
 
+import math
 from array import array
 
 import kernel
 import pytest
-from upright.tick import FOLLOW_CHIP, Tick
+from upright.tick import FOLLOW_CHIP, SNAPSHOT_WORDS, TURNS, Tick
 
 PERIOD = 5000
 
 
 class Imu:
     """Delivers what the test says; counts how it was used."""
+
+    gyro_scale = (82, 5)
 
     def __init__(self):
         self.counts = array("h", [0] * 11)
@@ -48,6 +51,10 @@ class Filter:
         self.flags = []
         self.words = []
         self.state = array("i", [0] * 6)
+
+    def bias(self, out):
+        for i in range(3):
+            out[i] = 256 * len(self.flags)
 
     def update(self, counts):
         self.flags.append(counts[10])
@@ -248,31 +255,132 @@ def interrupted(tick, times):
     tick._state = state
 
 
-@pytest.mark.parametrize("times", range(14))
+@pytest.mark.parametrize("times", range(40))
 def test_a_snapshot_is_never_torn(tick, times):
     ticks_at(tick, [5000])
     interrupted(tick, times)
-    out = array("i", [0] * 7)
+    out = array("i", [0] * SNAPSHOT_WORDS)
     assert tick.snapshot(out)
     assert len(set(out[:4])) == 1
     assert out[5] == out[0]  # the steps of the same step
 
 
 def test_a_plain_copy_of_the_state_would_be_torn(tick):
-    ticks_at(tick, [5000])
-    interrupted(tick, 3)
-    copy = [tick._state[i] for i in range(1, 8)]
-    assert len(set(copy[:4])) > 1
+    """Of the set that is written next: the tick is ahead of a reader that takes it."""
+    ticks_at(tick, [5000, 10000])
+    interrupted(tick, 9)
+    copy = [tick._state[i] for i in range(len(tick._state))]
+    assert len(set(copy[6:10])) > 1
 
 
 def test_a_snapshot_that_cannot_be_had_says_so(tick):
     ticks_at(tick, [5000])
     interrupted(tick, 10**6)
-    assert not tick.snapshot(array("i", [0] * 7))
+    assert not tick.snapshot(array("i", [0] * SNAPSHOT_WORDS))
 
 
-def test_a_snapshot_taken_while_the_state_is_written_is_refused(tick):
-    """Another core would see the sequence odd."""
+def test_a_reader_that_cuts_into_the_tick_finds_the_step_before(tick, filter):
+    """An interrupt above the tick's, or another core, at any word of the set that is being written."""
     ticks_at(tick, [5000])
-    tick._state[0] |= 1
-    assert not tick.snapshot(array("i", [0] * 7))
+    found = []
+
+    class Watched(array):
+        def __setitem__(self, i, value):
+            array.__setitem__(self, i, value)
+            if i != 0:  # with word 0 the new set is the newest
+                out = array("i", [0] * SNAPSHOT_WORDS)
+                assert tick.snapshot(out)
+                found.append((len(set(out[:4])), out[0], out[5]))
+
+    tick._state = Watched("i", tick._state)
+    ticks_at(tick, [10000])
+    assert len(found) > 14
+    assert set(found) == {(1, 1, 1)}
+
+
+def test_a_short_array_for_a_snapshot_is_refused(tick):
+    """Native code would write behind its end."""
+    with pytest.raises(ValueError, match="15 words"):
+        tick.snapshot(array("i", [0] * 7))
+
+
+def test_rates_are_those_of_the_step_less_the_bias(tick, imu, filter):
+    for counts, rate in ((0, 0), (16400, 1000000), (-32768, -1998049), (32767, 1997988)):
+        imu.counts[3] = counts
+        ticks_at(tick, [kernel.now() + PERIOD])
+        out = array("i", [0] * 3)
+        assert tick.rates_into(out)
+        bias = len(filter.flags) * 5000 / 82  # a count a step
+        assert out[0] == pytest.approx(rate - bias, abs=1)
+
+
+class Yaw(Filter):
+    """Turns about z by `degrees` a step."""
+
+    degrees = 0
+
+    def update(self, counts):
+        Filter.update(self, counts)
+        half = math.radians(self.degrees * len(self.flags) / 2)
+        self.state[1:5] = array(
+            "i", [round(math.cos(half) * 2**29), 0, 0, round(math.sin(half) * 2**29)]
+        )
+
+
+@pytest.mark.parametrize("degrees", [50, -50, 7, -3])
+def test_full_turns_are_counted_both_ways(imu, degrees):
+    filter = Yaw()
+    filter.degrees = degrees
+    tick = Tick(imu, filter, PERIOD)
+    tick.seeded()
+    out = array("i", [0] * SNAPSHOT_WORDS)
+    for k in range(1, 300):
+        ticks_at(tick, [PERIOD * k])
+        tick.snapshot(out)
+        yaw = math.degrees(2 * math.atan2(out[3], out[0]))
+        yaw = (yaw + 180) % 360 - 180
+        if abs(abs(yaw) - 180) > 0.01:
+            assert yaw + 360 * out[TURNS] == pytest.approx(degrees * k, abs=0.01)
+
+
+# on_step and what must not stop the tick
+
+
+def test_on_step_is_called_after_each_step_with_its_argument(imu, filter):
+    seen = []
+    tick = Tick(imu, filter, PERIOD, on_step=seen.append, argument="face")
+    ticks_at(tick, [5000, 10000])
+    assert seen == ["face"] * 2
+    tick = Tick(imu, filter, 0, on_step=lambda _: seen.append(tick.steps))
+    imu.packets = [1, 2, 3]
+    tick.on_fifo(None)
+    assert seen[2:] == [1, 2, 3]
+
+
+def test_an_exception_of_on_step_is_counted_by_itself_and_the_tick_goes_on(imu, filter):
+    display = Display()
+
+    def fall(_):
+        raise RuntimeError("no motor")
+
+    tick = Tick(imu, filter, PERIOD, display, on_step=fall)
+    ticks_at(tick, [5000, 10000])
+    assert (tick.steps, tick.step_errors, tick.crashes) == (2, 2, 0)
+    assert str(tick.step_error) == "no motor"
+    assert display.asked == [32, 32]  # and the rest of the tick was done
+
+
+@pytest.mark.parametrize("where", ["driver", "on_step"])
+def test_a_ctrl_c_that_lands_in_the_tick_is_kept(imu, filter, where):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    tick = Tick(imu, filter, PERIOD, on_step=interrupt if where == "on_step" else None)
+    if where == "driver":
+        imu.fail = KeyboardInterrupt()
+    ticks_at(tick, [5000])
+    assert isinstance(tick.interrupt, KeyboardInterrupt)
+    assert (tick.crashes, tick.step_errors) == (0, 0)
+    imu.fail = None
+    ticks_at(tick, [10000])
+    assert tick.steps >= 1

@@ -29,4 +29,4 @@ def data_ready_pin():
 
 
 def make_tick(rate, callback):
-    return timing.make_tick(rate, callback, pyb_timer=4)
+    return timing.make_tick(rate, callback, 4)

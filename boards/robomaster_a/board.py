@@ -68,4 +68,4 @@ def data_ready_pin():
 
 
 def make_tick(rate, callback):
-    return timing.make_tick(rate, callback, pyb_timer=_TICK_TIMER)
+    return timing.make_tick(rate, callback, _TICK_TIMER)

@@ -26,4 +26,4 @@ def data_ready_pin():
 
 
 def make_tick(rate, callback):
-    return timing.make_tick(rate, callback, microseconds=True)
+    return timing.make_tick(rate, callback)

@@ -7,8 +7,9 @@ import math
 import sys
 import time
 
+import upright
 from micropython import const
-from upright import settings as config
+from upright.settings import Settings, of_board
 
 from upright_app import axis_check
 
@@ -31,7 +32,7 @@ class Source:
     def __init__(self, board, rate_hz=None):
         """Opens them. Raises OSError when the sensor does not answer; mag is None without a magnetometer, and mag_fault
         says why there is none where one belongs."""
-        self.config = settings = config.Config(board)
+        self.config = settings = Settings(of_board(board))
         self.imu = imu = board.sensor()
         imu.configure(
             accel_range_g=settings.ACCEL_RANGE_G,
@@ -136,6 +137,7 @@ def axes(board, south=False, tumble_ms=_TUMBLE_MS):
 
     Nothing has to be typed: each step goes on when the board lies still as it should. Returns the list of problems.
     """
+    upright.stop()
     problems = []
     try:
         source = Source(board, _RATE_HZ)
@@ -264,6 +266,7 @@ class _Counter:
 
 def report(board):
     """Who answers, which rates are kept, what is free: printed; returns the list of problems, each with what to do."""
+    upright.stop()
     problems = []
     version = ".".join([str(x) for x in sys.implementation.version[:3]])
     print("%s, %s %s on %s" % (board.NAME, sys.implementation.name, version, sys.platform))
@@ -271,7 +274,8 @@ def report(board):
     if hasattr(gc, "mem_free"):
         print("heap: %d bytes free" % gc.mem_free())
     try:
-        settings = config.Config(board)
+        settings = Settings(of_board(board))
+        settings.check(9 if hasattr(board, "magnetometer") else 6)
     except ValueError as why:
         problems.append(str(why))
         _conclude(problems)

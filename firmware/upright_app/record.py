@@ -6,8 +6,9 @@ import os
 import time
 from array import array
 
+import upright
 from micropython import const
-from upright import settings as config
+from upright.settings import Settings, of_board
 
 _WORDS = const(11)
 _BLOCK = const(64)  # rows that are written at once: 1408 bytes
@@ -28,7 +29,7 @@ def run(path="recording.imu", seconds=60, rate_hz=100, board=None, file=None):
     """
     if board is None:
         import board
-    _stop_application()
+    upright.stop()  # a tick that was left running would go on using the bus
     imu, mag = _open(board, rate_hz)
     num, den = imu.sample_rate
     rows = max(1, seconds * num // den)
@@ -128,7 +129,7 @@ class _Recorder:
 
 
 def _open(board, rate_hz):
-    settings = config.Config(board)
+    settings = Settings(of_board(board))
     imu = board.sensor()
     # no dlpf: the filter follows the rate, so that nothing aliases
     imu.configure(settings.ACCEL_RANGE_G, settings.GYRO_RANGE_DPS, sample_rate_hz=rate_hz)
@@ -170,16 +171,3 @@ def _free(path):
         return None
     found = os.statvfs(path[: path.rfind("/") + 1] or ".")
     return found[0] * found[3] - _SPARE
-
-
-def _stop_application():
-    """Stop the ticks of an application that was left by Ctrl-C: they would go on using the bus."""
-    try:
-        import __main__
-    except ImportError:
-        return
-    application = getattr(__main__, "application", None)
-    for name in ("ticker", "guard"):
-        ticker = getattr(application, name, None)
-        if ticker is not None:
-            ticker.stop()

@@ -1,1 +1,46 @@
-# Upright: attitude (roll, pitch, yaw) from an MPU6050 or an MPU6500 with an IST8310.
+# Upright: attitude (roll, pitch, yaw) from an MPU6050, or from an MPU6500 with an IST8310.
+#
+#     import upright
+#     imu = upright.start()
+#     roll, pitch, yaw = imu.angles()
+#
+# Each function imports what it needs when it is called: a program that wants one module alone pays for that alone.
+
+
+def start(**settings):
+    """Start with the sensors and settings of board.py -> AHRS (upright/ahrs.py). A start before this one is stopped.
+
+    settings: those of AHRS, in place of the board's: start(rate=100, filter="mahony6", on_step=control).
+    """
+    stop()
+    return from_board(**settings).start()
+
+
+def from_board(**settings):
+    """The same, not started yet: `with upright.from_board() as imu: ...`"""
+    try:
+        import board
+    except ImportError as why:
+        if "board" not in str(why):
+            raise
+        raise ImportError(
+            "no board.py here, which `upright flash` installs; without one: "
+            "imu = upright.AHRS(MPU6050(i2c)).start()"
+        )
+    from upright import ahrs
+
+    return ahrs.from_board(board, **settings)
+
+
+def AHRS(sensor, rate=200, **options):
+    """An AHRS of a driver object of one's own, not started yet: see upright/ahrs.py for its options."""
+    from upright import ahrs
+
+    return ahrs.AHRS(sensor, rate, **options)
+
+
+def stop():
+    """Stop every AHRS that runs: afterwards nothing but the program itself uses a bus."""
+    from upright import ahrs
+
+    ahrs.stop()

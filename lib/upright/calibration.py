@@ -33,14 +33,21 @@ _ROW_MOST = const(2000000)  # ppm: sum of the magnitudes in a row of a matrix
 _DET_LEAST = const(50000)
 
 _UNIT = (1000000, 0, 0, 0, 1000000, 0, 0, 0, 1000000)
+_ROWS = ((1000000, 0, 0), (0, 1000000, 0), (0, 0, 1000000))
+_UP_LEAST = const(707107)  # cos 45 deg: the tilt of a trim
+_OPTIONAL = ("up_ppm",)  # fields that a file has only where they are at work
 _ZERO = (0, 0, 0)
 
 # the words of apply()
 _PROBE = const(0)  # always -1: ptr32 zero-extends where a word is 64 bits, see fixmath.py
-# 2 times 3 rows: matrix, axis map included, 3 words Q14; constant, Q14, 8192 for rounding
+# accelerometer, gyro, magnetometer: 3 rows of a matrix with axis map and trim, 3 words Q14; constant, Q14, 8192 for
+# rounding
 _M = const(1)
-_GYRO = const(25)  # 3 times the word that body x, y, z come from, and 1 where its sign is turned
-_WORDS = const(31)
+_GYRO = const(37)  # 3 times the word that body x, y, z come from, and 1 where its sign is turned
+_STRIDE = const(
+    43
+)  # 3 where a trim wants the gyro's matrix, else 6: the gyro's words are only put in their places
+_WORDS = const(44)
 
 
 class CalibrationError(ValueError):
@@ -71,7 +78,8 @@ class Calibration:
         counts = axis map (matrix (raw - offset)), rounded, saturated at int16
 
     for the accelerometer and for the magnetometer; the gyro gets its axis map alone, as its bias
-    belongs into the filter, which takes it finer than a count: see gyro_bias().
+    belongs into the filter, which takes it finer than a count: see gyro_bias(). A trim, for a
+    mounting that is tilted, turns the body's frame of all three: see set_level().
 
     imu_axes         body x, y, z (forward, left, up) as axes of the IMU: "x", "-y", ...
     mag_axes         the same for the magnetometer; this one may mirror, for there are
@@ -128,14 +136,17 @@ class Calibration:
         if s[_PROBE] > 0:
             k = 32
         flags = r[10]
-        bit = 1
-        at = 0  # the accelerometer's words, then the magnetometer's
+        stride = s[_STRIDE]
+        at = 0  # the accelerometer's words, the gyro's with a trim, the magnetometer's
         while at < 9:
+            bit = 1
+            if at == 6:
+                bit = 2
             if flags & bit:
                 x = ((r[at] & 0xFFFF) ^ 0x8000) - 0x8000
                 y = ((r[at + 1] & 0xFFFF) ^ 0x8000) - 0x8000
                 z = ((r[at + 2] & 0xFFFF) ^ 0x8000) - 0x8000
-                m = _M + at + at
+                m = _M + (at << 2)
                 i = at
                 while i < at + 3:
                     v = x * (s[m] << k >> k) + y * (s[m + 1] << k >> k)
@@ -147,9 +158,8 @@ class Calibration:
                     out[i] = v
                     m += 4
                     i += 1
-            bit = 2
-            at += 6
-        if flags & 1:
+            at += stride
+        if flags & 1 and stride == 6:
             i = 0
             while i < 3:
                 v = ((r[s[_GYRO + i]] & 0xFFFF) ^ 0x8000) - 0x8000
@@ -198,9 +208,9 @@ class Calibration:
         if bias is None:
             return None
         num, den = self.gyro_scale
-        return tuple(
-            [sign * _round(bias[i] * 256 * num, 1000000 * den) for i, sign in self._imu_axes]
-        )
+        body = [sign * bias[i] for i, sign in self._imu_axes]
+        body = [_dot(row, body, 1000000) for row in self._trim]
+        return tuple([_round(b * 256 * num, 1000000 * den) for b in body])
 
     def save_gyro_bias(self, path, x, y, z, chip=None, board=None):
         """Put a new gyro bias, in 1/256 count in the body's frame, into a file; the rest of it stays.
@@ -209,42 +219,55 @@ class Calibration:
         and for a bias beyond 60 deg/s, OSError when it cannot be written; then the file is as it
         was.
         """
-        try:
-            fields = read(path, chip, board)
-        except CalibrationError as why:
-            if why.kind != "missing":
-                raise
-            fields = blank(chip, board)
         num, den = self.gyro_scale
         bias = [0, 0, 0]
-        body = (x, y, z)
         for i in range(3):
             axis, sign = self._imu_axes[i]
-            bias[axis] = sign * _round(body[i] * 1000000 * den, 256 * num)
-        fields["gyro_bias_udps"] = bias
-        write(path, fields)
+            body = _dot([row[i] for row in self._trim], (x, y, z), 1000)  # 1/256000 count
+            bias[axis] = sign * _round(body * 1000 * den, 256 * num)
+        _put(path, "gyro_bias_udps", bias, chip, board)
         self.fields["gyro_bias_udps"] = bias
 
+    def set_level(self, up):
+        """Trim: from now on the body is level when it lies as it does now.
+
+        up: where up is then, 3 ints, 1e-6 of a unit vector, in the frame of the axis map without a
+        trim. Raises CalibrationError beyond 45 degrees, which is a case for the axis map.
+        """
+        fields = dict(self.fields)
+        fields["up_ppm"] = list(up)
+        check(fields)
+        self._use(fields)
+
+    def save_level(self, path, chip=None, board=None):
+        """Put the trim into a file; otherwise as save_gyro_bias()."""
+        _put(path, "up_ppm", self.fields["up_ppm"], chip, board)
+
     def _use(self, fields):
-        """Fold scales, axis maps and checked corrections into the words of apply()."""
+        """Fold scales, axis maps, trim and checked corrections into the words of apply()."""
         s = array("i", [0] * _WORDS)
         s[_PROBE] = -1
+        up = fields.get("up_ppm")
+        trim = _level(up) if up else _ROWS
         accel = fields["accel"] or {"offset_ug": _ZERO, "matrix_ppm": _UNIT}
         mag = fields["mag"] or {"offset_mlsb": _ZERO, "matrix_ppm": _UNIT}
         lsb = self.accel_lsb_per_g
-        _fold(s, _M, self._imu_axes, accel["matrix_ppm"], accel["offset_ug"], lsb, 1000000)
-        _fold(s, _M + 12, self._mag_axes, mag["matrix_ppm"], mag["offset_mlsb"], 1, 1000)
-        same = True
+        _fold(s, _M, trim, self._imu_axes, accel["matrix_ppm"], accel["offset_ug"], lsb, 1000000)
+        _fold(s, _M + 12, trim, self._imu_axes, _UNIT, _ZERO, 1, 1)
+        _fold(s, _M + 24, trim, self._mag_axes, mag["matrix_ppm"], mag["offset_mlsb"], 1, 1000)
+        same = not up
+        s[_STRIDE] = 3 if up else 6
         for i in range(3):
             axis, sign = self._imu_axes[i]
             s[_GYRO + i] = 3 + axis
             s[_GYRO + 3 + i] = 1 if sign < 0 else 0
             same = same and axis == i and sign > 0
-        for at in (_M, _M + 12):
+        for at in (_M, _M + 24):
             for i in range(12):
                 same = same and s[at + i] == (8192 if i & 3 == 3 else 16384 if i % 5 == 0 else 0)
         self.identity = same
         self.fields = fields
+        self._trim = trim
         for i in range(_WORDS):
             self._s[i] = s[i]
 
@@ -272,8 +295,10 @@ def check(fields, where="calibration"):
     accel            {"offset_ug": 3 ints, 1e-6 g, within +-0.5 g; "matrix_ppm": 9 ints, row by row};
                      or None
     mag              {"offset_mlsb": 3 ints, 1/1000 count, within +-20000 counts; "matrix_ppm"}; or None
+    up_ppm           the trim, absent without one: 3 ints, 1e-6, the unit vector that points up when the
+                     body is level, within 45 degrees of z, in the frame of the axis map
 
-    all in the chip's own frame. The magnitudes in a row of a matrix add up to 2 at the most, and its
+    the others in the chip's own frame. The magnitudes in a row of a matrix add up to 2 at the most, and its
     determinant is 0.05 at least.
     """
     _check_shape(fields, where)
@@ -331,6 +356,18 @@ def write(path, fields):
             raise
         os.remove(path)  # a file system, like FAT, that replaces nothing
         os.rename(path + _NEW, path)
+
+
+def _put(path, name, value, chip, board):
+    """Write one field of a file; the rest stays. A file that is missing is begun."""
+    try:
+        fields = read(path, chip, board)
+    except CalibrationError as why:
+        if why.kind != "missing":
+            raise
+        fields = blank(chip, board)
+    fields[name] = value
+    write(path, fields)
 
 
 def _exists(path):
@@ -398,6 +435,8 @@ def _text(fields):
                 _numbers(part["matrix_ppm"]),
             )
         lines.append(' "%s": %s,' % (key, text))
+    if "up_ppm" in fields:
+        lines.append(' "up_ppm": %s,' % _numbers(fields["up_ppm"]))
     lines.append("")
     return "\n".join(lines).encode()
 
@@ -412,7 +451,7 @@ def _check_shape(fields, where):
         raise CalibrationError("corrupt", "%s is not a dict" % where)
     if fields.get("format") != FORMAT or fields.get("version") != VERSION:
         raise CalibrationError("foreign", "%s is not %s %d" % (where, FORMAT, VERSION))
-    _check_keys(fields, blank(), where)
+    _check_keys(fields, blank(), where, _OPTIONAL)
     for key in ("chip", "board"):
         name = fields[key]
         if name is not None and not _is_name(name):
@@ -420,6 +459,8 @@ def _check_shape(fields, where):
     bias = fields["gyro_bias_udps"]
     if bias is not None:
         _check_numbers(bias, 3, where, "gyro_bias_udps")
+    if "up_ppm" in fields:
+        _check_numbers(fields["up_ppm"], 3, where, "up_ppm")
     for key, offset in (("accel", "offset_ug"), ("mag", "offset_mlsb")):
         part = fields[key]
         if part is not None:
@@ -441,14 +482,16 @@ def _check_bounds(fields, where):
         offset, matrix = fields["mag"]["offset_mlsb"], fields["mag"]["matrix_ppm"]
         _check_most(offset, _MAG_OFFSET_MOST, where, "mag.offset_mlsb")
         _check_matrix(matrix, where, "mag.matrix_ppm")
+    if "up_ppm" in fields:
+        _check_level(fields, where)
 
 
-def _check_keys(part, keys, where):
+def _check_keys(part, keys, where, more=()):
     for key in keys:
         if key not in part:
             raise CalibrationError("corrupt", "%s lacks %s" % (where, key))
     for key in part:
-        if key not in keys:
+        if key not in keys and key not in more:
             raise CalibrationError("corrupt", "%s has an unknown field, %s" % (where, key))
 
 
@@ -474,6 +517,20 @@ def _check_matrix(m, where, name):
     det += m[2] * (m[3] * m[7] - m[4] * m[6])
     if det < _DET_LEAST * 1000000 * 1000000:
         _wrong(where, name, m, "a matrix that is neither singular nor mirrors")
+
+
+def _check_level(fields, where):
+    up = fields["up_ppm"]
+    length = sum([u * u for u in up])
+    if not 998 <= length // 1000000000 <= 1002 or up[2] < _UP_LEAST:
+        _wrong(where, "up_ppm", up, "a unit vector within 45 deg of z; turn IMU_AXES instead")
+    # a row of the trim has magnitudes of up to 1.71 in all: what it makes of a matrix keeps the bound of a row
+    turned = max([sum([abs(x) for x in row]) for row in _level(up)])
+    for key in ("accel", "mag"):
+        m = _UNIT if fields[key] is None else fields[key]["matrix_ppm"]
+        largest = max([sum([abs(x) for x in m[i : i + 3]]) for i in (0, 3, 6)])
+        if turned * largest // 1000000 > _ROW_MOST:
+            _wrong(where, "up_ppm", up, "less tilt with this %s.matrix_ppm" % key)
 
 
 def _wrong(where, name, value, wanted):
@@ -509,17 +566,33 @@ def _axes(axes, name):
     return found, a * b * c != (1 if even else -1)
 
 
-def _fold(s, at, axes, matrix_ppm, offset, num, den):
+def _level(up):
+    """The rows, in ppm, of the shortest turn that takes the unit vector `up` to z."""
+    a, b, c = up
+    d = 1000000 + c
+    return (
+        (1000000 - _round(a * a, d), -_round(a * b, d), -a),
+        (-_round(a * b, d), 1000000 - _round(b * b, d), -b),
+        (a, b, c),
+    )
+
+
+def _dot(row, vector, den):
+    """row . vector / den, rounded."""
+    return _round(row[0] * vector[0] + row[1] * vector[1] + row[2] * vector[2], den)
+
+
+def _fold(s, at, trim, axes, matrix_ppm, offset, num, den):
     """12 words at s[at]: for each body axis a row of the matrix in Q14, and -row . offset.
 
     offset * num / den are counts. The constant belongs to the rounded row, so that a raw value near
     the offset comes out right whatever the rounding.
     """
     for i in range(3):
-        axis, sign = axes[i]
         c = 0
         for j in range(3):
-            m = sign * _round(matrix_ppm[3 * axis + j] * 16384, 1000000)
+            column = [sign * matrix_ppm[3 * axis + j] for axis, sign in axes]
+            m = _round(_dot(trim[i], column, 1000000) * 16384, 1000000)
             s[at + 4 * i + j] = m
             c -= m * offset[j]
         s[at + 4 * i + 3] = _round(c * num, den) + 8192

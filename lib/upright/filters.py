@@ -48,12 +48,10 @@ def make(name, rate, imu, gains):
 def make_hardware(name, imu, config):
     """Build a filter of HARDWARE on the driver `imu`, by config's RATE, DMP_IMAGE, DMP_SHA256 and IMU_AXES.
 
-    It takes the place of the driver, and it is the filter. Raises OSError for an image that is absent or not the one
-    that is known, ValueError for settings that it cannot keep.
+    It takes the place of the driver, and it is the filter; RATE is a whole number. Raises OSError for an image that is
+    absent or not the one that is known, ValueError for settings that it cannot keep.
     """
     num, den = config.RATE
-    if num % den or config.DRIVE != "timer":
-        raise ValueError('with %s DRIVE is "timer" and RATE a whole number' % name)
     more = {"known": (config.DMP_SHA256,)} if config.DMP_SHA256 else {}
     return _class(name)(imu, config.DMP_IMAGE, num // den, axes=config.IMU_AXES, **more)
 

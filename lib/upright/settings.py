@@ -1,12 +1,16 @@
-# The settings of a board and what they are when board.py does not say. Every port.
+# The settings of a board: what they are when nobody says otherwise, and which values they can have.
+# Needs calibration.py, filters.py. Every port.
+
+from upright import calibration, filters
 
 DEFAULTS = {
-    # Sampling. RATE: steps of the filter in Hz, or (num, den) for num/den Hz.
+    # Sampling. RATE: steps of the filter in Hz, or (num, den) for num/den Hz, whatever drives them.
     "RATE": 200,
     # "timer": a timer's tick reads the newest sample; "data_ready": the chip's INT line is the tick;
-    # "fifo": a timer at FIFO_HZ fetches the samples that the chip has queued.
-    "DRIVE": "timer",
-    # Of the chip, Hz; None: as RATE. With the timer drive the chip may sample faster than it is read: a tick then
+    # "fifo": a timer at FIFO_HZ fetches the samples that the chip has queued; "manual": the program calls step().
+    # None: "timer" where timers interrupt the program, "fifo" where they wait for it.
+    "DRIVE": None,
+    # Of the chip with the timer drive, Hz; None: as RATE. The chip may sample faster than it is read: a tick then
     # never comes too early for a fresh sample, and its filter (DLPF) keeps the rest from aliasing.
     "SENSOR_RATE_HZ": None,
     "FIFO_HZ": 50,
@@ -20,13 +24,15 @@ DEFAULTS = {
     "MAG_AXES": ("x", "y", "z"),
     # Of the magnetometer, where board.py has one.
     "MAG_RATE_HZ": 100,
-    # Corrections and biases, see calibration.py; made by `upright calibrate`.
-    "CALIBRATION": "calibration.json",
-    # The filter by its name in filters.py; None: inertial9 where board.py has a magnetometer, else inertial6. And its
+    # Corrections and biases, see calibration.py; made by `upright calibrate`. None: no file.
+    "CALIBRATION": "upright_cal.json",
+    # The filter by its name in filters.py; None: inertial9 where there is a magnetometer, else inertial6. And its
     # own arguments, where its defaults are not wanted.
     "FILTER": None,
     "GAINS": {},
     "EULER": "zyx",
+    # Of the place, in degrees, east positive: a compass points so far to the right of true north.
+    "DECLINATION": 0,
     # For the filter "dmp6": the file with the DMP's image, which the user has to have, and its SHA-256 where the
     # library does not know it; `upright dmp check FILE` shows it.
     "DMP_IMAGE": "dmp.bin",
@@ -43,19 +49,132 @@ DEFAULTS = {
     "PAGE_SECONDS": 6,
 }
 
+DRIVES = ("timer", "data_ready", "fifo", "manual")
+FIFO_BATCH = 8  # packets that one tick of the FIFO drive fetches at most
+_NO_SETTINGS = ("NAME", "PLATFORM")
+_ACCEL_RANGES = (2, 4, 8, 16)
+_GYRO_SCALES = {250: (131, 1), 500: (131, 2), 1000: (164, 5), 2000: (82, 5)}
 
-class Config:
-    """DEFAULTS, with what the board module says otherwise, as attributes.
+
+def of_board(board):
+    """What a board module says, {setting: value}.
 
     Raises ValueError for a name in capitals that no setting has: a slip of the pen would otherwise go unnoticed.
     """
+    found = {}
+    for name in dir(board):
+        if not name.isupper() or name[0] == "_" or callable(getattr(board, name)):
+            continue
+        if name in DEFAULTS:
+            found[name] = getattr(board, name)
+        elif name not in _NO_SETTINGS:
+            raise ValueError(
+                "board.py sets %s, which is no setting; see upright/settings.py" % name
+            )
+    return found
 
-    def __init__(self, board):
-        for name in dir(board):
-            setting = name.isupper() and name[0] != "_" and not callable(getattr(board, name))
-            if setting and name not in ("NAME", "PLATFORM") and name not in DEFAULTS:
-                raise ValueError("board.py sets %s, which is no setting; see config.py" % name)
+
+class Settings:
+    """DEFAULTS with what `given` says otherwise, {setting: value}, as attributes. RATE is always a pair.
+
+    Raises ValueError for a name that no setting has.
+    """
+
+    def __init__(self, given):
+        for name in given:
+            if name not in DEFAULTS:
+                raise ValueError("there is no setting %s; see upright/settings.py" % name)
         for name in DEFAULTS:
-            setattr(self, name, getattr(board, name, DEFAULTS[name]))
-        if isinstance(self.RATE, int):
+            setattr(self, name, given.get(name, DEFAULTS[name]))
+        if _is_int(self.RATE, 1):
             self.RATE = (self.RATE, 1)
+
+    def check(self, axes=6, drive=None):
+        """Look at every setting, for a board whose sensors have so many axes; drive: that which DRIVE = None became.
+
+        Raises ValueError with all that cannot be, each with what to change. What depends on the chip that is found
+        and on the timer is looked at later.
+        """
+        wrong = []
+        rate = self.RATE
+        good_rate = isinstance(rate, (tuple, list)) and len(rate) == 2
+        good_rate = good_rate and _is_int(rate[0], 1) and _is_int(rate[1], 1)
+        self._demand(wrong, "RATE", good_rate, "Hz as a positive int, or (num, den) for num/den Hz")
+        drives = self.DRIVE is None or self.DRIVE in DRIVES
+        self._demand(wrong, "DRIVE", drives, ", ".join(['"%s"' % name for name in DRIVES]))
+        for name in ("FIFO_HZ", "MAG_RATE_HZ"):
+            self._demand(wrong, name, _is_int(getattr(self, name), 1), "Hz as a positive int")
+        sampled = self.SENSOR_RATE_HZ
+        if sampled is not None:
+            good = _is_int(sampled, 1) or isinstance(sampled, tuple)
+            self._demand(wrong, "SENSOR_RATE_HZ", good, "Hz as a positive int, or None")
+        self._demand(wrong, "ACCEL_RANGE_G", self.ACCEL_RANGE_G in _ACCEL_RANGES, "2, 4, 8 or 16")
+        self._demand(
+            wrong, "GYRO_RANGE_DPS", self.GYRO_RANGE_DPS in _GYRO_SCALES, "250, 500, 1000 or 2000"
+        )
+        self._demand(wrong, "EULER", self.EULER in ("zyx", "zxy"), '"zyx" or "zxy"')
+        chunk = self.DISPLAY_CHUNK
+        good = _is_int(chunk, 8, 128) and chunk % 8 == 0
+        self._demand(wrong, "DISPLAY_CHUNK", good, "a multiple of 8, 8..128")
+        self._demand(wrong, "PAGE_SECONDS", _is_number(self.PAGE_SECONDS, 0), "seconds, 0 or more")
+        self._demand(wrong, "DECLINATION", _is_number(self.DECLINATION, -180, 180), "degrees")
+        good = self.CALIBRATION is None or isinstance(self.CALIBRATION, str)
+        self._demand(wrong, "CALIBRATION", good, "the name of a file, or None")
+        try:
+            calibration.Calibration(self.IMU_AXES, self.MAG_AXES)
+        except (ValueError, TypeError) as why:
+            wrong.append(str(why))
+        if not wrong:
+            self._check_combinations(wrong, axes, drive or self.DRIVE)
+        if wrong:
+            raise ValueError("; ".join(wrong))
+
+    def _check_combinations(self, wrong, axes, drive):
+        num, den = self.RATE
+        if drive == "fifo" and num > FIFO_BATCH * self.FIFO_HZ * den:
+            wrong.append(
+                "with FIFO_HZ %d the FIFO drive keeps up with %d Hz: FIFO_HZ %d, or a lower RATE"
+                % (self.FIFO_HZ, FIFO_BATCH * self.FIFO_HZ, -(-num // (FIFO_BATCH * den)))
+            )
+        if drive == "timer" and _is_int(self.SENSOR_RATE_HZ) and not self.EXTERNAL_CLOCK:
+            if self.SENSOR_RATE_HZ * den < num:
+                wrong.append(
+                    "SENSOR_RATE_HZ is %d: the chip has to sample at RATE or faster"
+                    % self.SENSOR_RATE_HZ
+                )
+        name = self.filter_name(axes)
+        try:
+            filters.check(name)
+            if name not in filters.HARDWARE:
+                filters.make(name, self.RATE, _Scales(self), self.GAINS)
+            elif num % den or drive not in (None, "timer"):
+                wrong.append('with %s DRIVE is "timer" and RATE a whole number' % name)
+        except ValueError as why:
+            wrong.append(str(why))
+
+    def filter_name(self, axes):
+        return self.FILTER or filters.default(axes == 9)
+
+    def _demand(self, wrong, name, good, wanted):
+        if not good:
+            wrong.append("%s is %r, expected %s" % (name, getattr(self, name), wanted))
+
+
+class _Scales:
+    """What a filter wants to know of a sensor."""
+
+    def __init__(self, settings):
+        self.gyro_scale = _GYRO_SCALES[settings.GYRO_RANGE_DPS]
+        self.accel_lsb_per_g = 32768 // settings.ACCEL_RANGE_G
+
+
+def _is_int(value, low=None, high=None):
+    if not isinstance(value, int) or isinstance(value, bool):
+        return False
+    return (low is None or value >= low) and (high is None or value <= high)
+
+
+def _is_number(value, low, high=None):
+    if not isinstance(value, (int, float)):
+        return False
+    return value >= low and (high is None or value <= high)

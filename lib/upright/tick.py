@@ -8,15 +8,30 @@ from time import ticks_add, ticks_diff, ticks_us
 import micropython
 from micropython import const
 
-# The published state, array('i'): a sequence number that is odd while the rest is being written, quaternion Q29
-# (w x y z), flags of the last sample, number of steps, number of those with a fresh sample.
+from upright.fixmath import euler
+
+# The published state, array('i'): a sequence number, whether on_step is called, the side of north at the last step, and
+# the counters of steps, of steps with a fresh sample and of turns; then two sets. The newest is that of the sequence's
+# lowest bit; a step writes the other one and then moves the sequence on, so that a reader in an interrupt that cut into
+# the tick finds a whole set as well.
 _SEQUENCE = const(0)
-_Q = const(1)
-_FLAGS = const(5)
-_STEPS = const(6)
-_FRESH_STEPS = const(7)
-_WORDS = const(8)
-SNAPSHOT_WORDS = const(7)  # what snapshot() gives: the state from _Q on
+_CALLS = const(1)  # _CALL_ON_STEP or 0
+_SIDE = const(2)
+_STEPS = const(3)
+_FRESH_STEPS = const(4)
+_TURNS = const(5)
+_SETS = const(6)
+_WORDS = const(36)
+# A set, and what snapshot() gives: quaternion Q29 (w x y z), flags, steps, steps with a fresh sample, full turns of the
+# yaw, accelerometer x y z, gyro x y z, temperature (counts, calibrated, body frame)
+SNAPSHOT_WORDS = const(15)
+FLAGS = const(4)
+STEPS = const(5)
+FRESH_STEPS = const(6)
+TURNS = const(7)
+ACCEL = const(8)
+GYRO = const(11)
+TEMPERATURE = const(14)
 
 # The timer's clock is the one that ticks_us shows, give or take make_tick's rounding (100 ppm: 0.1 of a period behind).
 FOLLOW_TIMER = const(10)
@@ -35,27 +50,97 @@ _REPAIRS = const(8)
 _MOST_COASTS = const(16)
 
 
+# A reader is cut into by one step in 100 at most; more often and the tick leaves no time for anybody
+_TRIES = const(100)
+
+# What _publish answers
+_HEALTH_DUE = const(1)
+_CALL_ON_STEP = const(2)
+
+
 @micropython.viper
 def _publish(state: ptr32, q: ptr32, counts: ptr16) -> int:
-    """Write the state of this step; 1 when the chip's health is due: now and then, and after every sample that failed.
+    """Write the set of this step; _HEALTH_DUE now and then and after every sample that failed, _CALL_ON_STEP as set.
 
-    The sequence is odd meanwhile: whoever reads then, from another core or a nested interrupt, sees that.
+    Turns are counted where the yaw passes 180 deg: the sine of the yaw changes its sign while its cosine is negative.
     """
-    sequence = state[_SEQUENCE] + 1
-    state[_SEQUENCE] = sequence & _WRAP
-    i = 0
-    while i < 4:
-        state[_Q + i] = q[i]
-        i += 1
+    sequence = (state[_SEQUENCE] + 1) & _WRAP
+    at = _SETS
+    if sequence & 1:
+        at += SNAPSHOT_WORDS
+    state[at] = q[0]
+    state[at + 1] = q[1]
+    state[at + 2] = q[2]
+    state[at + 3] = q[3]
+    # Q15, signed by arithmetic: ptr32 zero-extends where a word is 64 bits
+    w = ((q[0] >> 14 & 0x3FFFF) ^ 0x20000) - 0x20000
+    x = ((q[1] >> 14 & 0x3FFFF) ^ 0x20000) - 0x20000
+    y = ((q[2] >> 14 & 0x3FFFF) ^ 0x20000) - 0x20000
+    z = ((q[3] >> 14 & 0x3FFFF) ^ 0x20000) - 0x20000
+    side = 1  # west
+    if w * z + x * y < 0:
+        side = 2  # east
+    turns = state[_TURNS]
+    before = state[_SIDE]
+    if side != before:
+        state[_SIDE] = side
+        if before and w * w + x * x < y * y + z * z:
+            turns += side + side - 3
+            state[_TURNS] = turns
     flags = counts[10]
-    state[_FLAGS] = flags
     steps = (state[_STEPS] + 1) & _WRAP
+    fresh = (state[_FRESH_STEPS] + (flags & _FRESH)) & _WRAP
     state[_STEPS] = steps
-    state[_FRESH_STEPS] = (state[_FRESH_STEPS] + (flags & _FRESH)) & _WRAP
-    state[_SEQUENCE] = (sequence + 1) & _WRAP
+    state[_FRESH_STEPS] = fresh
+    state[at + FLAGS] = flags
+    state[at + STEPS] = steps
+    state[at + FRESH_STEPS] = fresh
+    state[at + TURNS] = turns
+    i = 0
+    at += ACCEL
+    while i < 6:
+        state[at + i] = counts[i]
+        i += 1
+    state[at + 6] = counts[9]
+    state[_SEQUENCE] = sequence
     if flags & _FRESH and steps & (_HEALTH_EVERY - 1):
-        return 0
-    return 1
+        return state[_CALLS]
+    return state[_CALLS] | _HEALTH_DUE
+
+
+@micropython.viper
+def _copy(state: ptr32, out: ptr32) -> int:
+    """The newest set into out; its sequence number."""
+    sequence = state[_SEQUENCE]
+    at = _SETS
+    if sequence & 1:
+        at += SNAPSHOT_WORDS
+    i = 0
+    while i < ACCEL:
+        out[i] = state[at + i]
+        i += 1
+    while i < SNAPSHOT_WORDS:
+        out[i] = ((state[at + i] & 0xFFFF) ^ 0x8000) - 0x8000
+        i += 1
+    return sequence
+
+
+@micropython.viper
+def _rates(state: ptr32, out: ptr32, num: int, den: int):
+    """out[0..2], a bias in 1/256 count, becomes the newest set's gyro less that bias, in mdeg/s; den/num is 1 count.
+
+    At most 40960 counts and 255/256: with den up to 5000 (+-2000 deg/s) the products stay below 2**28.
+    """
+    at = _SETS + GYRO
+    if state[_SEQUENCE] & 1:
+        at += SNAPSHOT_WORDS
+    i = 0
+    while i < 3:
+        counts = ((state[at + i] & 0xFFFF) ^ 0x8000) - 0x8000
+        bias = ((out[i] & 0xFFFFFF) ^ 0x800000) - 0x800000
+        rate = (counts << 8) - bias
+        out[i] = ((rate >> 8) * den + ((rate & 255) * den >> 8) + (num >> 1)) // num
+        i += 1
 
 
 # The methods of the tick are native code: it takes half the time, and a bytecode frame over 11 words, which a `try`
@@ -63,18 +148,20 @@ def _publish(state: ptr32, q: ptr32, counts: ptr16) -> int:
 
 
 class Tick:
-    """One step a sample: read -> calibrate -> update -> publish, then at most `chunk` bytes of the new display.
+    """One step a sample: read -> calibrate -> update -> publish -> on_step, then at most `chunk` bytes of the display.
 
     `on_sample` and `on_fifo` are the callbacks (made once here, since fetching a bound method allocates): on_sample
     for a timer or the chip's data-ready line, on_fifo for a timer that drains the FIFO. They never raise: what
     goes wrong is counted in `missed` (ticks that never came, made up for by coasting), `crashes` (with the last one
-    in `error`), and in the driver's and display's own counters.
+    in `error`), `step_errors` (of on_step, the last in `step_error`), and in the driver's and display's own counters.
+    A KeyboardInterrupt that lands in the tick is kept in `interrupt` for the main program to raise.
 
     period_us    the sample period, to notice ticks that never came; 0 with the FIFO, whose packets say it
     follow       how readily the expected time follows the ticks' own clock: by late / 2**follow a tick
     display      given only where the tick owns the display's bus
     calibration  None: the filter gets the driver's counts as they are
     mag          a magnetometer that is read by itself, its bus being the tick's; None where it comes with the sample
+    on_step      called with `argument` after each step; the rules of a hard interrupt are its rules too
     """
 
     def __init__(
@@ -87,6 +174,8 @@ class Tick:
         follow=FOLLOW_TIMER,
         calibration=None,
         mag=None,
+        on_step=None,
+        argument=None,
     ):
         self._imu = imu
         self._filter = filter
@@ -100,23 +189,35 @@ class Tick:
         self._follow = follow
         self._due = ticks_us()
         self._started = False
-        self._made_up = 0
-        self._inside = False
+        self._coasted_ahead = 0
+        self._running = False
         self._seen = -1
         self._state = array("i", [0] * _WORDS)
+        self._state[_CALLS] = 0 if on_step is None else _CALL_ON_STEP
         self._q = memoryview(filter.state)[filter.QUATERNION : filter.QUATERNION + 4]
+        num, den = imu.gyro_scale
+        self._num, self._den = num, 1000 * den  # counts per mdeg/s
+        self._on_step = on_step
+        self._argument = argument
+        # the quaternion of each set, for a reader that may not allocate
+        self._sets = [
+            memoryview(self._state)[at : at + 4] for at in (_SETS, _SETS + SNAPSHOT_WORDS)
+        ]
         self.missed = 0
         self.crashes = 0
         self.error = None
+        self.step_errors = 0
+        self.step_error = None
+        self.interrupt = None
         self.on_sample = self._on_sample
         self.on_fifo = self._on_fifo
         self.on_guard = self._on_guard
 
     @micropython.native
     def _on_sample(self, source):
-        if self._inside:  # another source of the same tick, at a higher priority
+        if self._running:  # another source of the same tick, at a higher priority
             return
-        self._inside = True
+        self._running = True
         try:
             if self._on_time():
                 self._imu.read()
@@ -125,16 +226,16 @@ class Tick:
                 self._step()
                 if self._display is not None:
                     self._display.flush_step(self._chunk)
-        except Exception as error:
+        except BaseException as error:
             # it must not stop the timer: counted, and shown by the main program
             self._crashed(error)
-        self._inside = False
+        self._running = False
 
     @micropython.native
     def _on_fifo(self, source):
-        if self._inside:
+        if self._running:
             return
-        self._inside = True
+        self._running = True
         try:
             imu = self._imu
             n = imu.fifo_poll()
@@ -148,17 +249,17 @@ class Tick:
                 n -= 1
             if self._display is not None:
                 self._display.flush_step(self._chunk)
-        except Exception as error:
+        except BaseException as error:
             self._crashed(error)
-        self._inside = False
+        self._running = False
 
     @micropython.native
     def _on_guard(self, source):
         """Slow timer beside the data-ready line: a chip that has reset itself raises it no more, and has to be
         found and put right all the same."""
-        if self._inside:
+        if self._running:
             return
-        self._inside = True
+        self._running = True
         try:
             if self._state[_STEPS] == self._seen:
                 self._imu.read()
@@ -166,9 +267,9 @@ class Tick:
                 if self._display is not None:  # which is to show that the sensor is lost
                     self._display.flush_step(self._chunk)
             self._seen = self._state[_STEPS]
-        except Exception as error:
+        except BaseException as error:
             self._crashed(error)
-        self._inside = False
+        self._running = False
 
     @micropython.native
     def _look_after(self):
@@ -177,9 +278,13 @@ class Tick:
         while n > 0 and self._imu.health() == _REPAIRING:
             n -= 1
 
+    @micropython.native
     def _crashed(self, error):
-        self.crashes = (self.crashes + 1) & _WRAP
-        self.error = error
+        if isinstance(error, Exception):
+            self.crashes = (self.crashes + 1) & _WRAP
+            self.error = error
+        else:
+            self.interrupt = error
 
     @micropython.native
     def _on_time(self):
@@ -200,12 +305,12 @@ class Tick:
         if late >= period:
             self._coast(late // period)
             due = self._due
-        elif self._made_up:
+        elif self._coasted_ahead:
             if late < -(period >> 1):
-                self._made_up -= 1
+                self._coasted_ahead -= 1
                 return False
             if late < period >> 1:
-                self._made_up = 0
+                self._coasted_ahead = 0
         self._due = ticks_add(due, period + (late >> self._follow))
         return True
 
@@ -214,7 +319,7 @@ class Tick:
         self._due = ticks_add(self._due, lost * self._period)
         if lost > _MOST_COASTS:
             lost = _MOST_COASTS
-        self._made_up = lost
+        self._coasted_ahead = lost
         self._counts[10] &= ~_ANY_FRESH
         while lost > 0:
             self._filter.update(self._counts)
@@ -226,15 +331,44 @@ class Tick:
         if self._calibration is not None:
             self._calibration.apply(self._raw)
         self._filter.update(counts)
-        if _publish(self._state, self._q, counts):
-            self._imu.health()
+        due = _publish(self._state, self._q, counts)
+        if due:
+            if due & _CALL_ON_STEP:
+                self._call_on_step()
+            if due & _HEALTH_DUE:
+                self._imu.health()
 
-    # -- for the main program
+    @micropython.native
+    def _call_on_step(self):
+        try:
+            self._on_step(self._argument)
+        except BaseException as error:
+            if isinstance(error, Exception):
+                self.step_errors = (self.step_errors + 1) & _WRAP
+                self.step_error = error
+            else:
+                self.interrupt = error
+
+    # -- for the main program, while no tick comes
+    def seeded(self):
+        """Publish the filter's attitude and the newest counts as they are, as no step."""
+        state = self._state
+        was = [state[i] for i in (_STEPS, _FRESH_STEPS)]
+        _publish(state, self._q, self._counts)
+        at = _SETS + SNAPSHOT_WORDS * (state[_SEQUENCE] & 1)
+        state[_STEPS], state[_FRESH_STEPS] = state[at + STEPS], state[at + FRESH_STEPS] = was
+
+    def calibrate(self, calibration):
+        """Take another calibration from the next step on; None: the driver's counts as they are."""
+        self._calibration = calibration
+        self._counts = self._raw if calibration is None else calibration.counts
+
     def resume(self):
         """Before the ticks go on after they were stopped: that time is not one of ticks that never came."""
         self._started = False
-        self._made_up = 0
+        self._coasted_ahead = 0
 
+    # -- for every program, interrupts and a second core included: nothing allocates
     @property
     def steps(self):
         """Steps of the filter, ticks made up for not counted."""
@@ -245,17 +379,47 @@ class Tick:
         """Steps that had a fresh sample."""
         return self._state[_FRESH_STEPS]
 
+    @micropython.native
     def snapshot(self, out):
-        """Copy the published state into out, an array('i') of SNAPSHOT_WORDS, all of one step: quaternion Q29
-        (w x y z), flags, steps, steps with a fresh sample.
+        """Copy what was published with the newest step into out, an array('i') of SNAPSHOT_WORDS: the words are named
+        at the top of this file.
 
         -> False when the tick never left it alone for long enough (then out is not to be used).
         """
-        state = self._state
-        for _ in range(100):
-            before = state[_SEQUENCE]
-            for i in range(SNAPSHOT_WORDS):
-                out[i] = state[_Q + i]
-            if before == state[_SEQUENCE] and not before & 1:
+        if len(out) < SNAPSHOT_WORDS:
+            raise ValueError("a snapshot takes %d words" % SNAPSHOT_WORDS)
+        n = _TRIES
+        while n > 0:
+            if _copy(self._state, out) == self._state[_SEQUENCE]:
                 return True
+            n -= 1
+        return False
+
+    @micropython.native
+    def angles_into(self, out, order="zyx"):
+        """Roll, pitch, yaw of the newest step in millidegrees into out, an array('i') of 3 words or more; as snapshot.
+
+        See fixmath.euler for the order.
+        """
+        n = _TRIES
+        while n > 0:
+            sequence = self._state[_SEQUENCE]
+            euler(self._sets[sequence & 1], out, order)
+            if sequence == self._state[_SEQUENCE]:
+                return True
+            n -= 1
+        return False
+
+    @micropython.native
+    def rates_into(self, out):
+        """Rates of turn of the newest step about body x, y, z, free of the filter's bias, in millidegrees per second,
+        into out[0..2]; as snapshot."""
+        n = _TRIES
+        while n > 0:
+            sequence = self._state[_SEQUENCE]
+            self._filter.bias(out)
+            _rates(self._state, out, self._num, self._den)
+            if sequence == self._state[_SEQUENCE]:
+                return True
+            n -= 1
         return False

@@ -17,6 +17,7 @@ CONFIG = {
     "world": None,  # an .imu file; None: at rest for ever
     "board_name": "sim",  # folder in boards/
     "board": {},  # what board.py says otherwise
+    "program": "main.py",  # what runs; a program of one's own calls its AHRS `imu`
     "seconds": 10,  # of simulated time
     "frame_ms": 0,  # 0: no pictures; else the display's every so many ms
     "out": None,  # a file for the state after every step, 7 int32: world row, attitude (4, Q29), flags, time in us
@@ -72,6 +73,12 @@ class Frames:
             print("\ttime", now)
 
 
+def the_ahrs():
+    """The AHRS that the program runs, or None."""
+    face = sys.modules.get("upright.ahrs")
+    return face.running[0] if face and face.running else None
+
+
 class Recorder:
     """The attitude after every step, with the row of the world that it belongs to."""
 
@@ -83,21 +90,21 @@ class Recorder:
         self._q = array("i", [0] * 4)
         self._steps = 0
         self._mag = 0
-        self.main = {}
 
     def after_irq(self):
-        app = self.main.get("application")
-        if app is None or app.tick is None or app.tick.steps == self._steps:
+        imu = the_ahrs()
+        if imu is None or imu.tick.steps == self._steps:
             return
-        self._steps = app.tick.steps
-        app.filter.quaternion(self._q)
+        self._steps = imu.tick.steps
+        imu.filter.quaternion(self._q)
         self._chip.poll(kernel.now())
         self._row[0] = self._world.index_at(self._chip.sample_us)
         for i in range(4):
             self._row[1 + i] = self._q[i]
-        flags = app.counts[10]
-        if app.mag and app.mag.fresh != self._mag:
-            self._mag = app.mag.fresh
+        flags = imu.counts[10]
+        mag = imu.magnetometer
+        if mag and mag.fresh != self._mag:
+            self._mag = mag.fresh
             flags |= 2  # with the FIFO it may have come with any packet of this tick
         self._row[5] = flags
         self._row[6] = kernel.now()
@@ -136,15 +143,14 @@ def main():
     if config["twin"] == "main_writes_shared_bus":
         spoil_display_ownership()
     program = {"__name__": "__main__"}
-    if recorder:
-        recorder.main = program
     try:
-        execute("main.py", program)
+        execute(config["program"], program)
     except kernel.PowerOff:
         pass
     except kernel.Reset as reset:
         print("reset, cause", reset.args[0])
-    finish(program.get("application"), recorder, parts)
+    application = program.get("application")
+    finish(application.imu if application else program.get("imu"), recorder, parts)
 
 
 def spoil_display_ownership():
@@ -155,17 +161,17 @@ def spoil_display_ownership():
 
     def poll_and_flush(self):
         poll(self)
-        if self.display.busy:
-            self.display.flush_step(self.config.DISPLAY_CHUNK)
+        if self.imu.display.busy:
+            self.imu.display.flush_step(self.imu.settings.DISPLAY_CHUNK)
 
     app.App.poll = poll_and_flush
 
 
 def execute(name, namespace):
-    """Run a file of the board's root, as the interpreter does when it starts."""
-    for folder in sys.path:
+    """Run a file of the board's root, as the interpreter does when it starts, or of another place."""
+    for folder in [""] if name.startswith("/") else sys.path:
         try:
-            with open(folder + "/" + name) as file:
+            with open(folder + "/" + name if folder else name) as file:
                 exec(compile(file.read(), name, "exec"), namespace)
                 return
         except OSError:
@@ -173,7 +179,7 @@ def execute(name, namespace):
     raise OSError("no %s on the path" % name)
 
 
-def finish(app, recorder, parts):
+def finish(imu, recorder, parts):
     buses = parts.buses
     result = {
         "ended_us": kernel.now(),
@@ -185,26 +191,27 @@ def finish(app, recorder, parts):
         "heap_checked": sys.implementation.name == "micropython",
         "started": False,
     }
-    if app is not None and app.tick is not None:
-        tick, imu = app.tick, app.imu
+    if imu is not None and imu.tick is not None:
+        status = imu.status()
         result["started"] = True
-        result["steps"] = tick.steps
-        result["fresh"] = tick.fresh
-        result["missed"] = tick.missed
-        result["crashes"] = tick.crashes
-        result["error"] = repr(tick.error) if tick.error else None
-        result["errors"] = imu.errors
-        result["resets"] = imu.resets
-        result["fifo_overflows"] = imu.fifo_overflows
-        result["bias_known"] = app.bias.known
-        result["angles_mdeg"] = list(app.angles)
-        result["ticker"] = app.ticker.what
-        result["display_errors"] = app.display.errors if app.display else None
-        result["chip"] = imu.chip
-        result["filter"] = app.filter.NAME
-        result["axes"] = app.filter.AXES
-        if app.mag:
-            mag = app.mag
+        for name in ("steps", "fresh", "missed", "crashes", "errors", "resets", "fifo_overflows"):
+            result[name] = status[name]
+        result["error"] = repr(status["error"]) if status["error"] else None
+        result["step_errors"] = status["step_errors"]
+        result["step_error"] = repr(status["step_error"]) if status["step_error"] else None
+        result["bias_known"] = status["bias_known"]
+        angles = array("i", [0] * 3)
+        imu.angles_into(angles)
+        result["angles_mdeg"] = list(angles)
+        result["ticker"] = status["timer"]
+        result["drive"] = status["drive"]
+        result["faults"] = status["faults"]
+        result["display_errors"] = status["display_errors"] if imu.display else None
+        result["chip"] = status["sensor"]
+        result["filter"] = status["filter"]
+        result["axes"] = imu.filter.AXES
+        mag = imu.magnetometer
+        if mag:
             for name in ("fresh", "stale", "saturated", "errors", "resets"):
                 result["mag_" + name] = getattr(mag, name)
     if recorder:

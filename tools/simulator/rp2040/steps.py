@@ -8,8 +8,10 @@ from array import array
 
 from rp2040.board import Board, BoardError
 
-# The tick's state (lib/upright/tick.py): the words that are looked at here
-_SEQUENCE, _Q, _STEPS = 0, 1, 6
+# The words of the tick's state (lib/upright/tick.py) that are looked at. The newest set is that of the lowest bit of
+# the first word.
+_SEQUENCE, _STEPS, _SETS, _SET_WORDS = 0, 3, 6, 15
+_SET_STEPS = 5  # of a set, whose first words are the quaternion
 # Run on the board behind the making of a Tick: where its words are
 TELL_PLACES = """
 import uctypes
@@ -76,13 +78,11 @@ class Steps:
         state = self.words(0)
         if self.first_state is None:
             self.first_state = self.words(2)
-        number = state[_STEPS]
-        if (
-            number
-            and (not self.history or self.history[-1][0] != number)
-            and not state[_SEQUENCE] & 1
-        ):
-            step = (number, self._row, self.words(1, "h"), list(state[_Q : _Q + 4]))
+        newest = state[_SETS + _SET_WORDS * (state[_SEQUENCE] & 1) :][:_SET_WORDS]
+        number = newest[_SET_STEPS]
+        complete = state[_STEPS] == number
+        if number and complete and (not self.history or self.history[-1][0] != number):
+            step = (number, self._row, self.words(1, "h"), list(newest[:4]))
             self.history.append(step)
 
 

@@ -1,0 +1,743 @@
+# AHRS: sensor, calibration, filter and tick as one object that a program holds; attitude and heading in degrees.
+# Needs the modules that it imports, a filter of filters.py, and timing.py for every drive but the manual one.
+# Every port. Set-up and readings may allocate and use floats; what the tick runs does neither.
+
+import math
+import time
+from array import array
+
+import micropython
+from micropython import const
+
+from upright import calibration as calibrations
+from upright import filters
+from upright import tick as ticks
+from upright.bias import Bias
+from upright.reading import Reading
+from upright.settings import DEFAULTS, FIFO_BATCH, Settings, of_board
+
+_RATE_MS = const(1000)  # between two looks at the rate, the bias, the DMP
+_LOST_MS = const(300)  # without a fresh sample the attitude is only carried on
+_HEADING_MS = const(300)  # the first magnetometer sample is waited for as long
+_GUARD_HZ = const(50)
+_STILL_DPS = const(3)  # while level() is asked for
+_TRIAL_STEPS = const(16)
+
+# The counters of status() that are sums of things that went wrong
+_FAULTS = (
+    "missed crashes step_errors errors resets fifo_overflows display_errors "
+    "magnetometer_errors magnetometer_resets misaligned stalls"
+)
+
+running = []  # every AHRS whose tick runs
+
+
+def stop():
+    """Stop every AHRS: afterwards nothing but the main program uses a bus."""
+    for ahrs in list(running):
+        ahrs.stop()
+
+
+def from_board(board, **settings):
+    """An AHRS of the sensors and settings of a board's module (boards/README.md), not started.
+
+    settings: as of AHRS, in place of the board's.
+    """
+    options = {
+        "magnetometer": getattr(board, "magnetometer", None),
+        "timer": board.make_tick,
+        "display": board.display,
+        "data_ready": getattr(board, "data_ready_pin", None),
+        "board": board.NAME,
+    }
+    found = of_board(board)
+    for name in found:
+        options[name.lower()] = found[name]
+    options.update(settings)
+    return AHRS(board.sensor(), **options)
+
+
+class AHRS:
+    """Attitude from a sensor, step by step in an interrupt, and what it means in degrees.
+
+    sensor        a driver: MPU6050(i2c), MPU6500(spi, select), ...
+    rate          steps per second: int, or (num, den) for num/den Hz
+    filter        its name in filters.py; None: inertial9 with a magnetometer, else inertial6
+    magnetometer  a driver, or a function that makes it of the sensor's driver
+    drive         "timer", "fifo", "data_ready" or "manual"; None: timer where timers are hard, else fifo
+    timer         None: the best one of the port; its number; or a make_tick(rate, callback) as of timing.py
+    calibration   the file of corrections, see calibration.py; None: none
+    display       a driver, or a function that makes it of display_chunk; with display_shares_bus it is on the sensor's
+                  bus, and the tick writes what its show() hands over
+    on_step       called with this object in the tick, after each step, for control loops; for it hold the rules of
+                  a hard interrupt: it may not allocate, nor take long. Its exceptions are counted, see status()
+    data_ready    the pin that the sensor's INT line is on, or a function that makes it: for that drive
+    board         the board's name, of which a calibration file may be
+    say           called with a title and short lines while a person has to wait or to do something
+    log           called with what was found, as print is; None: nobody wants to know
+
+    All other settings of settings.py, in lower case, too: accel_range_g=4, imu_axes=("y", "-x", "z"), euler="zxy", ...
+
+    Constructing touches no bus. start() finds, configures and calibrates the sensor and lets the tick run; stop() ends
+    it; `with` does both. sensor, magnetometer, calibration, filter, tick, ticker and display are there to be looked at.
+
+    A KeyboardInterrupt that comes while the tick runs does not stop it: the next call from the program raises it.
+    """
+
+    def __init__(
+        self,
+        sensor,
+        rate=200,
+        filter=None,
+        magnetometer=None,
+        drive=None,
+        timer=None,
+        calibration=DEFAULTS["CALIBRATION"],
+        display=None,
+        on_step=None,
+        data_ready=None,
+        board=None,
+        say=None,
+        log=print,
+        **settings,
+    ):
+        given = {"RATE": rate, "FILTER": filter, "DRIVE": drive, "CALIBRATION": calibration}
+        for name in settings:
+            given[name.upper()] = settings[name]
+        self.settings = Settings(given)
+        self.board = board
+        self.drive = drive
+        self.say = say or _nothing
+        self.log = log or _nothing
+        self._driver = self.sensor = sensor
+        self._magnetometer = magnetometer
+        self.magnetometer = None
+        self._own_mag = (
+            None  # the same, where it is read by itself and not with the sensor's sample
+        )
+        self._data_ready = data_ready
+        self._timer = timer
+        self._on_step = on_step
+        self.display = display(self.settings.DISPLAY_CHUNK) if callable(display) else display
+        self._display_found = False
+        self._filter_in_sensor = False  # sensor and filter are one object
+        self.calibration = None
+        self.filter = None
+        self.tick = None
+        self.ticker = None
+        self._guard = None
+        self.bias = Bias(self)
+        self.notes = []  # what the start could not do, in a few words each
+        self.yaw_zero = (
+            0,
+            0,
+        )  # what is taken from the yaw, and from the yaw with its full turns, millidegrees
+        self.rate_hz = 0
+
+    # ------------------------------------------------------------------------------------ start and stop
+
+    def start(self):
+        """Find, configure and calibrate the sensor, take the attitude from its first sample, let the tick run.
+
+        Settings come first, all of them, before anything moves. Raises ValueError for those that cannot be, with what
+        to change, and the driver's OSError when the sensor does not answer. One that runs already starts anew.
+        """
+        self.stop()
+        settings = self.settings
+        axes = 6 if self._magnetometer is None else 9
+        settings.check(axes)
+        neighbours = self._neighbours()
+        self.drive = self._choose_drive(neighbours)
+        settings.check(axes, self.drive)
+        for other in neighbours:
+            other._hold()
+        try:
+            self._set_up(settings.filter_name(axes))
+            running.append(self)
+            _run_together(neighbours + [self])
+        except BaseException:
+            if self in running:
+                running.remove(self)
+                self._hold()
+            if neighbours:
+                _run_together(neighbours)
+            raise
+        what = self.ticker.what if self.ticker else "calls of step()"
+        self.log("tick: %s, every %d us, %s drive" % (what, self.period_us, self.drive))
+        return self
+
+    def stop(self):
+        """End the tick: the bus is the program's again. The last attitude stays."""
+        if self not in running:
+            return
+        running.remove(self)
+        self._hold()
+        neighbours = [
+            other for other in running if _bus(other) is not None and _bus(other) is _bus(self)
+        ]
+        if neighbours:
+            _run_together(neighbours)
+
+    def __enter__(self):
+        return self if self in running else self.start()
+
+    def __exit__(self, *_):
+        self.stop()
+
+    def _neighbours(self):
+        """Those that run on the same bus. One that has the same chip is stopped: it was left by a program."""
+        bus = _bus(self)
+        found = []
+        for other in list(running):
+            if bus is not None and _bus(other) is bus:
+                if other._driver.place[1] == self._driver.place[1]:
+                    other.stop()
+                else:
+                    found.append(other)
+        return found
+
+    def _choose_drive(self, neighbours):
+        """The drive, and whether its timer can be had: one is made for a moment."""
+        settings = self.settings
+        drive = settings.DRIVE
+        if neighbours:
+            first = neighbours[0]
+            drive = drive or first.drive
+            same = drive == first.drive and drive != "data_ready"
+            if drive == "fifo":
+                same = same and settings.FIFO_HZ == first.settings.FIFO_HZ
+            else:
+                same = same and settings.RATE == first.settings.RATE
+            if not same:
+                raise ValueError(
+                    'two sensors on one bus share one tick: the same DRIVE ("timer" or "fifo") and the same RATE'
+                )
+            return drive
+        if drive is None:
+            probe = self._make_tick(settings.FIFO_HZ, _nothing)
+            probe.stop()
+            soft = not probe.hard and settings.filter_name(6) not in filters.HARDWARE
+            drive = "fifo" if soft else "timer"
+        if drive == "data_ready" and self._data_ready is None:
+            raise ValueError('DRIVE is "data_ready": data_ready has to be the pin that INT is on')
+        if drive != "manual":
+            rates = {"timer": settings.RATE, "fifo": settings.FIFO_HZ, "data_ready": _GUARD_HZ}
+            self._make_tick(rates[drive], _nothing).stop()
+        return drive
+
+    def _make_tick(self, rate, callback):
+        if callable(self._timer):
+            return self._timer(rate, callback)
+        from upright import timing
+
+        return timing.make_tick(rate, callback, self._timer)
+
+    def _hold(self):
+        for name in ("ticker", "_guard"):
+            ticker = getattr(self, name)
+            if ticker is not None:
+                ticker.stop()
+                setattr(self, name, None)
+
+    # ------------------------------------------------------------------------------------ set-up
+
+    def _set_up(self, name):
+        settings = self.settings
+        self.notes = []
+        self.bias.known = False
+        self._filter_name = name
+        self._filter_in_sensor = name in filters.HARDWARE
+        self._open_display()
+        self.say("Upright", self.board or "", "looking for", "the sensor")
+        self._open_sensor()
+        sensor = self.sensor
+        # every packet or data-ready edge is one step, so the chip's rate is the rate
+        chips_rate = self.drive in ("fifo", "data_ready") and not settings.EXTERNAL_CLOCK
+        self.rate = rate = sensor.sample_rate if chips_rate else settings.RATE
+        num, den = rate
+        self.period_us = (2000000 * den + num) // (2 * num)
+        self.rate_hz = (2 * num + den) // (2 * den)  # until the first second has been counted
+        self.magnetometer = self._own_mag = None
+        if not self._filter_in_sensor:
+            self._open_magnetometer()
+        self._load_calibration()
+        if self._filter_in_sensor:
+            self.filter = sensor
+            self.bias.known = True  # it takes care of that itself
+        else:
+            self.filter = filters.make(name, rate, sensor, settings.GAINS)
+            self.bias.find()
+            self._seed()
+        self._make_step()
+        now = time.ticks_ms()
+        self._looked_at = self._fresh_at = self._mag_at = now
+        self._steps = self._last_fresh = self._last_mag = 0
+
+    def _open_display(self):
+        if self.display is None or self._display_found:
+            return
+        try:
+            self.display.begin()
+            self._display_found = True
+        except OSError as why:
+            # the attitude is worth having without a display; it may still appear
+            self.log("display:", why)
+
+    def _open_sensor(self):
+        settings = self.settings
+        self.sensor = sensor = self._driver
+        if self._filter_in_sensor:
+            self.sensor = sensor = filters.make_hardware(self._filter_name, sensor, settings)
+            sensor.configure()
+            self.log("dmp: image %s, %d bytes" % (sensor.version, sensor.image.size))
+        else:
+            # SENSOR_RATE_HZ is the timer drive's
+            faster = settings.SENSOR_RATE_HZ if self.drive in ("timer", "manual") else None
+            sensor.configure(
+                accel_range_g=settings.ACCEL_RANGE_G,
+                gyro_range_dps=settings.GYRO_RANGE_DPS,
+                dlpf=settings.DLPF,
+                sample_rate_hz=faster or settings.RATE,
+            )
+        self.log(
+            "sensor: %s, %d/%d Hz, +-%d g, +-%d deg/s"
+            % ((sensor.chip,) + sensor.sample_rate + (sensor.accel_range_g, sensor.gyro_range_dps))
+        )
+
+    def _open_magnetometer(self):
+        """Without it, or until it answers, the attitude comes from six axes."""
+        mag = self._magnetometer
+        if mag is None:
+            return
+        sensor, settings = self.sensor, self.settings
+        self.magnetometer = mag = mag(sensor) if callable(mag) else mag
+        self._own_mag = mag if hasattr(mag, "read") else None
+        rate = settings.RATE if settings.EXTERNAL_CLOCK else sensor.sample_rate
+        if self._own_mag is None and self.drive == "timer" and rate != settings.RATE:
+            raise ValueError(
+                "the magnetometer's sample comes with one of the IMU's and none may go by unread: "
+                "SENSOR_RATE_HZ has to be RATE"
+            )
+        try:
+            mag.configure(rate_hz=settings.MAG_RATE_HZ, sample_rate=rate)
+            self.log("magnetometer: %s, %d/%d Hz" % ((mag.chip,) + mag.sample_rate))
+        except OSError as why:
+            self.log("magnetometer:", why)
+            self.notes.append("no magnetometer")
+            mag.attach()  # should it answer yet, the tick finds it and sets it up
+
+    def _load_calibration(self):
+        sensor, settings = self.sensor, self.settings
+        self.calibration = calibrations.Calibration(
+            settings.IMU_AXES, settings.MAG_AXES, sensor.accel_lsb_per_g, sensor.gyro_scale
+        )
+        if settings.CALIBRATION is None:
+            return
+        try:
+            self.calibration.load(settings.CALIBRATION, sensor.chip, self.board)
+            self.log("calibration:", settings.CALIBRATION)
+        except calibrations.CalibrationError as why:
+            self.log("calibration: %s; going on with defaults" % why)
+            self.notes.append(why.title)
+
+    @property
+    def counts(self):
+        """The newest sample as the filter gets it: calibrated, in the body's frame."""
+        return self.sensor.counts if self.calibration.identity else self.calibration.counts
+
+    def sample(self):
+        """Read a sample while no tick does -> its flags."""
+        flags = self.sensor.read()
+        if self._own_mag is not None:
+            flags = self._own_mag.read(self.sensor.counts)
+        if not self.calibration.identity:
+            self.calibration.apply(self.sensor.counts)
+        return flags
+
+    def _seed(self):
+        """The attitude from a first sample, heading included where a magnetometer has one; from level when none comes
+        (the tick's feedback does the rest)."""
+        start = time.ticks_ms()
+        passed = 0
+        read_us = None
+        while passed < 2 * _HEADING_MS:
+            began = time.ticks_us()
+            flags = self.sample()
+            took = time.ticks_diff(time.ticks_us(), began)
+            read_us = took if read_us is None else min(took, read_us)
+            passed = time.ticks_diff(time.ticks_ms(), start)
+            # one sample in several has the magnetometer's: none may go by unread
+            ready = self.magnetometer is None or self.filter.AXES < 9 or flags & 2
+            ready = ready or passed > _HEADING_MS
+            if flags & 1 and ready and self.filter.seed(self.counts):
+                self._demand_time(read_us)
+                return
+            time.sleep_us(100)
+        self.log("seed: no usable accelerometer sample, starting level")
+
+    def _demand_time(self, read_us):
+        """A step has to fit into its period: the bus was timed, the filter is, on a twin."""
+        twin = filters.make(self._filter_name, self.rate, self.sensor, self.settings.GAINS)
+        best = None
+        for _ in range(2):
+            began = time.ticks_us()
+            for _ in range(_TRIAL_STEPS):
+                twin.update(self.counts)
+            took = time.ticks_diff(time.ticks_us(), began) // _TRIAL_STEPS
+            best = took if best is None else min(took, best)
+        step_us = read_us + best
+        if step_us > self.period_us:
+            raise ValueError(
+                "a step takes %d us (%d of them the bus), RATE leaves %d: RATE %d at most, a faster bus or a "
+                "lighter filter" % (step_us, read_us, self.period_us, 1000000 // step_us)
+            )
+
+    def _make_step(self):
+        display = self.display if self.settings.DISPLAY_SHARES_BUS else None
+        self.tick = tick = ticks.Tick(
+            self.sensor,
+            self.filter,
+            0 if self.drive == "fifo" else self.period_us,
+            display,
+            self.settings.DISPLAY_CHUNK,
+            ticks.FOLLOW_CHIP if self.drive == "data_ready" else ticks.FOLLOW_TIMER,
+            None if self.calibration.identity else self.calibration,
+            self._own_mag,
+            self._on_step,
+            self,
+        )
+        tick.seeded()
+        if display is not None and self._display_found:
+            while display.busy:  # the bus is the tick's from here on
+                display.flush_step(self.settings.DISPLAY_CHUNK)
+        if self.drive == "fifo":
+            self.sensor.fifo_enable(FIFO_BATCH)
+        elif self.drive == "data_ready":
+            self.sensor.configure_interrupt()
+
+    # ------------------------------------------------------------------------------------ for programs
+
+    def angles(self, order=None):
+        """(roll, pitch, yaw) of the newest step in degrees; order: "zyx" or "zxy", None: the setting EULER."""
+        return self.reading().angles(order)
+
+    def quaternion(self):
+        """(w, x, y, z): turns a vector of the body into the earth's frame (x north, y west, z up)."""
+        return self.reading().quaternion()
+
+    def rates(self):
+        """Rates of turn about body x, y, z in deg/s, free of the gyro's bias."""
+        return self.reading().rates()
+
+    def acceleration(self):
+        """What the accelerometer feels along body x, y, z in g."""
+        return self.reading().acceleration()
+
+    def linear_acceleration(self, frame="body"):
+        """The same without gravity; frame: "body" or "earth"."""
+        return self.reading().linear_acceleration(frame)
+
+    def heading(self):
+        """Degrees clockwise from true north, 0..360; None with six axes."""
+        return self.reading().heading()
+
+    def turns(self):
+        """The yaw as turns to the left, past half a turn as well."""
+        return self.reading().turns()
+
+    def temperature(self):
+        """Of the sensor's chip, in degC."""
+        return self.reading().temperature()
+
+    def reading(self):
+        """All of the above of one and the same step: a Reading."""
+        self._attend()
+        return Reading(self)
+
+    def wait(self, timeout_ms=1000):
+        """Wait for the next step -> its Reading. Raises OSError when none comes."""
+        steps = self._attend()
+        start = time.ticks_ms()
+        while self.tick.steps == steps:
+            if time.ticks_diff(time.ticks_ms(), start) > timeout_ms:
+                raise OSError("no step for %d ms: %s" % (timeout_ms, self._why()))
+            time.sleep_us(200)
+        return self.reading()
+
+    async def next(self, timeout_ms=1000):
+        """The same for asyncio: `reading = await imu.next()`."""
+        import asyncio
+
+        steps = self._attend()
+        start = time.ticks_ms()
+        while self.tick.steps == steps:
+            if time.ticks_diff(time.ticks_ms(), start) > timeout_ms:
+                raise OSError("no step for %d ms: %s" % (timeout_ms, self._why()))
+            await asyncio.sleep_ms(1)
+        return self.reading()
+
+    def step(self):
+        """One step, with the manual drive: the program calls it once a period. Late calls are coasted through."""
+        if self.drive != "manual" or self not in running:
+            raise RuntimeError('step() is for the "manual" drive, and started')
+        self.tick.on_sample(None)
+        self._attend()
+
+    def zero_yaw(self):
+        """From now on the yaw counts from where the body points now. heading() goes on from north."""
+        reading = self.reading()
+        self.yaw_zero = (0, 0)
+        yaw = reading.unwrapped_mdeg()
+        self.yaw_zero = ((yaw + 180000) % 360000 - 180000, yaw)
+
+    def level(self, save=True):
+        """The body is level as it lies now: the trim of a tilted mounting, up to 45 degrees, kept in the calibration
+        file if `save`. Set-up, with the body at rest: the tick is held for it, and the filter settles anew.
+
+        Raises ValueError while it turns, and for more tilt.
+        """
+        if self._filter_in_sensor:
+            raise ValueError(
+                "the DMP's attitude cannot be trimmed: use IMU_AXES, or another filter"
+            )
+        reading = self.reading()
+        if max([abs(rate) for rate in reading.rates()]) > _STILL_DPS:
+            raise ValueError("level() is for a body at rest: hold it still")
+        together = [other for other in running if other.ticker is self.ticker]
+        for other in together:
+            other._hold()
+        try:
+            self._trim()
+            if save and self.settings.CALIBRATION is not None:
+                path = self.settings.CALIBRATION
+                self.calibration.save_level(path, self.sensor.chip, self.board)
+        finally:
+            if self in running:
+                _run_together(together)
+
+    def _trim(self):
+        """The calibration gets the present tilt as its trim, the filter is turned along with the body's frame."""
+        calibration, filter = self.calibration, self.filter
+        bias = array("i", [0] * 3)
+        filter.bias(bias)
+        q = _times(filter.quaternion_floats(), _turn_of(calibration.fields.get("up_ppm"), 1))
+        w, x, y, z = q
+        up = (x * z - w * y, w * x + y * z, w * w + z * z - 0.5)  # half of it
+        before = calibration.fields.get("up_ppm")
+        calibration.set_level([round(2000000 * u) for u in up])
+        after = calibration.fields["up_ppm"]
+        filter.set_quaternion(*_times(q, _turn_of(after, -1)))
+        # the bias, from the one body's frame into the other
+        v = _turned(_turn_of(before, -1), [bias[i] for i in range(3)])
+        v = _turned(_turn_of(after, 1), v)
+        filter.set_bias(*[round(b) for b in v])
+        self.tick.calibrate(calibration)
+        calibration.apply(self.sensor.counts)
+        self.tick.seeded()
+
+    def status(self):
+        """What it is and how it fares, as a dict: names, flags and counters."""
+        self._attend()
+        sensor, mag, tick, filter = self.sensor, self.magnetometer, self.tick, self.filter
+        doubt = getattr(filter, "heading_uncertainty_mdeg", None)
+        lost = time.ticks_diff(time.ticks_ms(), self._fresh_at) >= _LOST_MS
+        mag_lost = mag is None or time.ticks_diff(time.ticks_ms(), self._mag_at) >= _LOST_MS
+        bias = array("i", [0] * 3)
+        filter.bias_mdps(bias)
+        found = {
+            "running": self in running,
+            "drive": self.drive,
+            "timer": self.ticker.what if self.ticker else None,
+            "sensor": sensor.chip,
+            "magnetometer": mag.chip if mag else None,
+            "filter": filter.NAME,
+            "rate_hz": self.rate_hz,
+            "steps": tick.steps,
+            "fresh": tick.fresh,
+            "sensor_lost": lost,
+            "magnetometer_lost": filter.AXES == 9 and mag_lost,
+            "bias_known": self.bias.known,
+            "bias_dps": tuple([b / 1000 for b in bias]),
+            "at_rest": getattr(filter, "resting", None),
+            "field_accepted": None
+            if filter.AXES < 9
+            else not mag_lost and getattr(filter, "mag_accepted", True),
+            "heading_uncertainty": None if doubt is None else doubt / 1000,
+            "missed": tick.missed,
+            "crashes": tick.crashes,
+            "error": tick.error,
+            "step_errors": tick.step_errors,
+            "step_error": tick.step_error,
+            "errors": sensor.errors,
+            "resets": sensor.resets,
+            "fifo_overflows": sensor.fifo_overflows,
+            "display_errors": self.display.errors if self.display else 0,
+        }
+        if mag is not None:
+            found["magnetometer_errors"] = mag.errors
+            found["magnetometer_resets"] = mag.resets
+        if self._filter_in_sensor:
+            found["misaligned"] = sensor.misaligned
+            found["stalls"] = sensor.stalls
+        found["faults"] = sum([found[name] for name in _FAULTS.split() if name in found])
+        return found
+
+    def refresh_display(self):
+        """Write a piece of what the display's show() has handed over, where the tick does not -> whether more is left.
+
+        For the main loop, as often as it can.
+        """
+        self._attend()
+        display = self.display
+        if display.busy and not self.settings.DISPLAY_SHARES_BUS:
+            display.flush_step(self.settings.DISPLAY_CHUNK)
+        return display.busy
+
+    def _attend(self):
+        """What every call from the program sees to -> the steps so far: an interrupt that landed in the tick, the rate,
+        and now and then the bias and the DMP."""
+        tick = self.tick
+        if tick is None:
+            raise RuntimeError("not started: start() comes first")
+        if tick.interrupt is not None:
+            interrupt, tick.interrupt = tick.interrupt, None
+            raise interrupt
+        now = time.ticks_ms()
+        if tick.fresh != self._last_fresh:
+            self._last_fresh = tick.fresh
+            self._fresh_at = now
+        mag = self.magnetometer
+        if mag is not None and mag.fresh != self._last_mag:
+            self._last_mag = mag.fresh
+            self._mag_at = now
+        passed = time.ticks_diff(now, self._looked_at)
+        if passed >= _RATE_MS and self in running:
+            self._looked_at = now
+            steps = tick.steps
+            self.rate_hz = ((steps - self._steps) * 1000 + passed // 2) // passed
+            self._steps = steps
+            if (
+                self.settings.KEEP_BIAS
+                and self.settings.CALIBRATION
+                and hasattr(self.filter, "resting")
+            ):
+                self.bias.keep((passed + 500) // 1000)
+            if self._filter_in_sensor and self.sensor.needs_reload:
+                self._reload()
+        return tick.steps
+
+    def _reload(self):
+        """The chip has lost its program. To load it takes the bus for most of a second, so the tick has to stop."""
+        together = [other for other in running if other.ticker is self.ticker]
+        for other in together:
+            other._hold()
+        try:
+            self.sensor.reload()
+            self.log("dmp: loaded again")
+        except OSError as why:
+            self.log("dmp:", why)
+        _run_together(together)
+
+    def _why(self):
+        if self not in running:
+            return "it is stopped"
+        return (
+            "the data-ready line is silent" if self.drive == "data_ready" else "the timer is silent"
+        )
+
+    # ------------------------------------------------------------------------------------ for interrupts too
+    # On every core, from a hard interrupt or from on_step: nothing below allocates, waits or uses a float.
+
+    @micropython.native
+    def snapshot(self, out):
+        """The newest step as integers into out, array('i') of tick.SNAPSHOT_WORDS: see the words in tick.py."""
+        return self.tick.snapshot(out)
+
+    @micropython.native
+    def angles_into(self, out):
+        """Roll, pitch, yaw in millidegrees into out, array('i') of 3, in the order of the setting EULER."""
+        self.tick.angles_into(out, self.settings.EULER)
+        zero = self.yaw_zero[0]
+        if zero != 0:
+            out[2] = (out[2] - zero + 180000) % 360000 - 180000
+
+    @micropython.native
+    def rates_into(self, out):
+        """Rates of turn about body x, y, z, free of the gyro's bias, in millidegrees/s into out, array('i') of 3."""
+        self.tick.rates_into(out)
+
+
+# ------------------------------------------------------------------------------------ one tick for one bus
+
+
+class _Together:
+    """The ticks of several sensors on one bus, one after the other."""
+
+    def __init__(self, callbacks):
+        self._callbacks = callbacks
+        self.on_tick = self._on_tick
+
+    @micropython.native
+    def _on_tick(self, source):
+        for callback in self._callbacks:
+            callback(source)
+
+
+def _run_together(members):
+    """Let these tick, all of one bus: their tickers are stopped."""
+    first = members[0]
+    for member in members:
+        member.tick.resume()
+    if first.drive == "manual":
+        return
+    if first.drive == "data_ready":
+        from upright import timing
+
+        pin = first._data_ready
+        pin = pin() if callable(pin) and not hasattr(pin, "irq") else pin
+        first.ticker = timing.DataReady(pin, first.tick.on_sample, first.period_us)
+        first._guard = first._make_tick(_GUARD_HZ, first.tick.on_guard)
+        return
+    fifo = first.drive == "fifo"
+    callbacks = [member.tick.on_fifo if fifo else member.tick.on_sample for member in members]
+    callback = callbacks[0] if len(callbacks) == 1 else _Together(callbacks).on_tick
+    ticker = first._make_tick(first.settings.FIFO_HZ if fifo else first.rate, callback)
+    for member in members:
+        member.ticker = ticker
+
+
+def _bus(ahrs):
+    place = getattr(ahrs._driver, "place", None)
+    return place and place[0]
+
+
+def _nothing(*_):
+    pass
+
+
+# ------------------------------------------------------------------------------------ quaternions as floats: level()
+
+
+def _turn_of(up, sign):
+    """The quaternion of a trim, 1, or of its opposite, -1: the shortest turn that takes `up` to z."""
+    if up is None:
+        return 1.0, 0.0, 0.0, 0.0
+    a, b, c = [u / 1000000 for u in up]
+    norm = math.sqrt(2 * (1 + c))
+    return (1 + c) / norm, sign * b / norm, -sign * a / norm, 0.0
+
+
+def _times(p, q):
+    a, b, c, d = p
+    w, x, y, z = q
+    return (
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    )
+
+
+def _turned(q, v):
+    w, x, y, z = q
+    return _times(_times(q, (0.0, v[0], v[1], v[2])), (w, -x, -y, -z))[1:]
