@@ -25,6 +25,7 @@ from upright_host import (
     rp2040,
     runtimes,
     score,
+    simulate,
     tune,
 )
 
@@ -75,11 +76,12 @@ for module in (
 def exec_file(
     file: Path = typer.Argument(..., help="The program.", exists=True, dir_okay=False),
     args: list[str] = typer.Argument(None, help="What it finds in sys.argv[1:]."),
-    runtime: str = options.runtime("unix"),
+    runtime: str = options.runtime(),
     board: str = typer.Option("sim", callback=paths.known_board, help="A folder of boards/."),
     seconds: float = options.seconds("Stop it after so much simulated time (default: never)."),
 ):
     """Run a MicroPython program on a simulated board: its chips on its buses, level, at rest, with a sensor's noise."""
+    runtime = runtime or simulate.best_runtime()
     argv, environment = runtimes.program(runtime, file, args or (), board, seconds)
     raise typer.Exit(subprocess.run(argv, env=environment).returncode)
 

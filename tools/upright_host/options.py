@@ -8,14 +8,6 @@ import typer
 from upright_host import runtimes
 from upright_host.console import Wrong
 
-# the groups of `upright --help`
-BOARD, DATA, STUDY, MAINTAIN = (
-    "Your board",
-    "Your data",
-    "Study, without a board",
-    "Maintain Upright",
-)
-
 
 def seconds(help: str = "Only the first so many seconds."):
     return typer.Option(None, help=help, callback=_positive)
