@@ -111,7 +111,7 @@ def samples(imu, n=1):
 def counted(imu, monkeypatch):
     """A list that grows by one for every register access of the driver."""
     accesses = []
-    read, write = imu._read_into, imu._write
+    read, write = imu.registers.read_into, imu.registers.write
 
     def counting_read(register, buffer):
         accesses.append(register)
@@ -121,8 +121,8 @@ def counted(imu, monkeypatch):
         accesses.append(register)
         write(register, value)
 
-    monkeypatch.setattr(imu, "_read_into", counting_read)
-    monkeypatch.setattr(imu, "_write", counting_write)
+    monkeypatch.setattr(imu.registers, "read_into", counting_read)
+    monkeypatch.setattr(imu.registers, "write", counting_write)
     return accesses
 
 
@@ -222,7 +222,7 @@ def test_places_follow_the_order_of_the_slots_and_their_lengths(imu, aux, device
     aux.start()
     samples(imu, 4)
     there = bytearray(24)
-    imu._read_into(EXT, there)
+    imu.registers.read_into(EXT, there)
     assert there == (
         device.registers[0x20:0x27] + other.registers[0x40:0x43] + device.registers[0x60:0x6E]
     )
@@ -246,7 +246,7 @@ def test_slots_are_programmed_while_all_are_disabled(imu, aux, device):
     assert off < min(programmed) and max(programmed) < on
     samples(imu, 3)
     there = bytearray(4)
-    imu._read_into(EXT, there)
+    imu.registers.read_into(EXT, there)
     assert there == device.registers[0x20:0x22] + device.registers[0x30:0x32]
 
 
@@ -265,7 +265,7 @@ def test_other_slots_get_their_places_anew(imu, aux, device):
     aux.start()
     samples(imu, 3)
     there = bytearray(6)
-    imu._read_into(EXT, there)
+    imu.registers.read_into(EXT, there)
     assert there == device.registers[0x40:0x45] + device.registers[0x50:0x51]
     assert imu.model.misuse == []
 
@@ -512,5 +512,5 @@ def test_everything_that_was_set_up_comes_back_after_a_reset_of_the_imu(imu, aux
     assert imu.resets == 1
     assert imu.read() is not None
     there = bytearray(3)
-    imu._read_into(EXT, there)
+    imu.registers.read_into(EXT, there)
     assert there == device.registers[0x20:0x23]

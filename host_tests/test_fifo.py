@@ -132,11 +132,11 @@ def test_without_the_look_at_the_overflow_flag_packets_would_be_misaligned():
     _, imu = running()
 
     def careless(n, fraction):
-        imu.registers.read_into(0x74, imu._views[n])
-        imu._at, imu._pending = 0, n
+        imu.registers.read_into(0x74, imu.fifo._views[n])
+        imu.fifo._at, imu.fifo._pending = 2, n
         return n
 
-    imu._fifo_drain = careless
+    imu.fifo.drain = careless
     kernel.advance(80_000)
     with pytest.raises(AssertionError):
         drain(imu)
@@ -582,8 +582,7 @@ def test_what_a_loose_wire_takes_from_a_packet_does_not_shift_the_next_ones(afte
     kernel.advance(4000)
     wire.after, wire.bytes = after, length
     n = imu.fifo_poll()
-    while imu._pending:
-        imu._pending -= 1
+    imu.fifo.take_all()
     wire.after = wire.bytes = 0
     numbers += nine_polled(imu, 120)
     assert n in (0, 3, 4, 5)

@@ -527,9 +527,10 @@ def test_health_costs_two_accesses_at_the_most(rig, monkeypatch):
         rig.mag.configure()
     rig.mag.attach()
     accesses = []
-    imu, read, write = rig.imu, rig.imu._read_into, rig.imu._write
-    monkeypatch.setattr(imu, "_read_into", lambda r, b: accesses.append(r) or read(r, b))
-    monkeypatch.setattr(imu, "_write", lambda r, v: accesses.append(r) or write(r, v))
+    bus = rig.imu.registers
+    read, write = bus.read_into, bus.write
+    monkeypatch.setattr(bus, "read_into", lambda r, b: accesses.append(r) or read(r, b))
+    monkeypatch.setattr(bus, "write", lambda r, v: accesses.append(r) or write(r, v))
     for i in range(300):
         if i == 100:
             rig.mag_chip.come_back()

@@ -347,7 +347,7 @@ class Broken:
 def test_any_bus_error_is_survived_whatever_the_port_calls_it(error):
     _, imu = running()
     imu.registers.bind(Broken(error))
-    imu.errors = (1 << 30) - 2
+    imu.monitor.errors = (1 << 30) - 2
     assert [imu.read(), imu.health(), imu.read()] == [0, HEALTH_BUS_ERROR, 0]
     assert imu.errors == 1  # the counter wraps within a small int
 

@@ -18,6 +18,7 @@ from upright.mpu6500 import (
     MPU6500_I2C,
     MPU6500Error,
 )
+from upright.mpu_monitor import VERIFY
 from upright_host import runtimes
 from world import StillWorld
 
@@ -497,7 +498,7 @@ def test_a_bus_that_raises_is_survived_and_the_chip_is_let_go(error):
     wire = Fault(machine.SPI(5))
     _, imu = running(spi=wire)
     wire.error = error
-    imu.errors = (1 << 30) - 2
+    imu.monitor.errors = (1 << 30) - 2
     assert [imu.read(), imu.health(), imu.read()] == [0, HEALTH_BUS_ERROR, 0]
     assert imu.errors == 1 and not selected()
     wire.error = None
@@ -577,7 +578,7 @@ def test_samples_are_withheld_until_the_gyro_has_settled(who):
     while True:
         kernel.advance(1000)
         fresh = imu.read() & FRESH
-        if imu.health() == HEALTH_REPAIRING and written is None and imu._writing < 0:
+        if imu.health() == HEALTH_REPAIRING and written is None and imu.monitor.state == VERIFY:
             written = kernel.now()
         if fresh:
             break
@@ -587,7 +588,6 @@ def test_samples_are_withheld_until_the_gyro_has_settled(who):
 def test_a_changed_register_of_others_is_found_and_put_right():
     chip, imu = running()
     imu.set_rows([(0x25, 0x8E, 0xFF), (0x34, 9, 0x1F)])
-    imu._hold = 0
     chip.poke(0x25, 0x0C)
     states = [imu.health() for _ in range(len(imu.configuration()))]
     assert states.count(HEALTH_MISMATCH) == 1

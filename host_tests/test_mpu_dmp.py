@@ -21,7 +21,7 @@ from test_fifo import Hostile, plans
 from upright import dmp as mpu_dmp
 from upright.dmp import MpuDmp, MpuDmpError
 from upright.mpu6050 import MPU6050, MPU6050Error
-from upright.mpu_common import HEALTH_OK
+from upright.mpu_monitor import HEALTH_OK
 from world import StillWorld, World
 
 LIB = Path(__file__).resolve().parents[1] / "lib" / "upright"
@@ -205,7 +205,7 @@ def test_a_nack_in_the_middle_of_the_load_is_an_error_that_names_the_place(part)
 
 def test_a_chip_that_is_not_there_is_the_drivers_own_error():
     machine.wire_i2c(0, MPU6050Chip(StillWorld(), address=0x69))
-    dmp = MpuDmp(MPU6050(machine.I2C(0)), V612, accept_unknown=True)
+    dmp = MpuDmp(MPU6050(machine.I2C(0), 0x68), V612, accept_unknown=True)
     with pytest.raises(MPU6050Error, match="no MPU6050 at 0x68"):
         dmp.configure()
 
@@ -323,7 +323,7 @@ def test_full_scale_is_flagged(image, counts, flags):
 def test_the_quaternion_is_the_packets_in_q30_and_in_q29(image):
     chip, dmp = running(image)
     ticks(dmp, 10)
-    raw = bytes(dmp._imu._batch[: dmp.image.packet])
+    raw = bytes(dmp.fifo.buffer[2 : 2 + dmp.image.packet])
     wanted = [int.from_bytes(raw[i : i + 4], "big", signed=True) for i in (0, 4, 8, 12)]
     q30, q29 = array("i", [0] * 4), array("i", [0] * 4)
     dmp.q30(q30)
@@ -522,7 +522,7 @@ def test_without_waiting_for_the_rest_of_a_packet_a_shifted_one_would_pass():
     chip, dmp = running(world=StillWorld((0, 0, 4096)))
     ticks(dmp, 20)
     dmp._partial = lambda fraction: (
-        dmp._imu._fifo_drain(1, 0) and mpu_dmp._parse(dmp._imu._batch, 0, dmp.state, dmp.counts)
+        dmp.fifo.drain(1, 0) and mpu_dmp._parse(dmp.fifo.buffer, 2, dmp.state, dmp.counts)
     )
     kernel.advance(50_000)
     Slipped(chip).lose(12)
@@ -563,8 +563,8 @@ def test_no_wrong_packet_whatever_happens_between_any_two_transactions(
         image, world=StillWorld((0, 0, 4096)), chip={"fifo_byte_us": byte_us}, rate_hz=200
     )
     chip.power_up_us = restart_us
-    wire = dmp._imu._i2c
-    dmp._imu._i2c = bus = Hostile(chip, kernel.now(), plan)
+    bus = Hostile(chip, kernel.now(), plan)
+    dmp._imu.registers.bind(bus)
     wanted = [0, 0, dmp.accel_lsb_per_g, 0, 0, 0]
 
     def step():
@@ -584,7 +584,7 @@ def test_no_wrong_packet_whatever_happens_between_any_two_transactions(
     for _ in range(100):
         step()
     kernel.advance(max(0, bus.now - kernel.now()))
-    dmp._imu._i2c = wire
+    dmp._imu.registers.bind(machine.I2C(0))
     if dmp.needs_reload or not chip.dmp.running:
         dmp.reload()
     # at another pace than the packets': never twice within the writing of one
@@ -684,7 +684,7 @@ def test_a_reload_that_fails_can_be_tried_again():
 
 def test_a_tick_that_cuts_into_a_reload_leaves_the_bus_alone():
     chip, dmp = running()
-    real = dmp._imu._write_from
+    real = dmp._imu.registers.write_from
     seen = []
 
     def cut(buffer):
@@ -692,7 +692,7 @@ def test_a_tick_that_cuts_into_a_reload_leaves_the_bus_alone():
         seen.append((dmp.read() & 1, dmp.health(), machine.I2C(0)._bus.bytes - before))
         real(buffer)
 
-    dmp._imu._write_from = cut
+    dmp._imu.registers.write_from = cut
     dmp.reload()
     assert len(seen) > 300 and set(seen) == {(0, HEALTH_OK, 0)}
     assert chip.dmp.running
@@ -732,7 +732,7 @@ def test_a_batch_that_the_fifo_cannot_hold_is_refused(batch):
 def checked():
     """(watch, modules) with checked viper functions; at the end nothing may have gone unexercised."""
     watch = overflow.Watch()
-    names = ("fixmath.py", "mpu_common.py", "dmp_setup.py", "dmp.py")
+    names = ("fixmath.py", "mpu_monitor.py", "mpu_fifo.py", "dmp_setup.py", "dmp.py")
     return watch, overflow.loaded([LIB / name for name in names], watch)
 
 
@@ -747,7 +747,7 @@ def packet_of(words, size, fill):
 @pytest.mark.parametrize("axes", [("x", "y", "z"), ("z", "-y", "x"), ("y", "z", "x")], ids="".join)
 def test_no_intermediate_leaves_32_bits_whatever_is_in_a_packet(checked, image, axes):
     watch, modules = checked
-    dmp = modules["dmp"].MpuDmp(MPU6050(None), image, accept_unknown=True, axes=axes)
+    dmp = modules["dmp"].MpuDmp(MPU6050(machine.I2C(0)), image, accept_unknown=True, axes=axes)
     rng = random.Random(3)
     good = 0
     for k in range(600):
@@ -781,7 +781,9 @@ def test_no_intermediate_leaves_32_bits_whatever_is_in_a_packet(checked, image, 
 def test_an_unjudged_packet_would_overflow(checked):
     """The twin: _turn is safe only with what _parse has let through."""
     _, modules = checked
-    dmp = modules["dmp"].MpuDmp(MPU6050(None), V612, accept_unknown=True, axes=("z", "-y", "x"))
+    dmp = modules["dmp"].MpuDmp(
+        MPU6050(machine.I2C(0)), V612, accept_unknown=True, axes=("z", "-y", "x")
+    )
     for i in range(4):
         dmp.state[5 + i] = 2 * ONE - 1 if dmp.state[14 + i] > 0 else -2 * ONE
     for i in range(16):

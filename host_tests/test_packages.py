@@ -54,7 +54,9 @@ def test_a_module_can_be_imported_with_its_package_alone(name, tmp_path):
 
 
 def test_the_mpu6500_comes_with_its_magnetometer():
-    assert {"mpu6500", "mpu_common", "ist8310", "auxiliary_bus"} <= set(packages.modules("mpu6500"))
+    assert {"mpu6500", "mpu_monitor", "ist8310", "auxiliary_bus"} <= set(
+        packages.modules("mpu6500")
+    )
     assert "mahony" not in packages.modules("mpu6500")
 
 

@@ -7,13 +7,8 @@ import sys
 # CPython and a compiled main program leave their folder out of the path.
 sys.path.append(__file__.rsplit("/", 1)[0] if "/" in __file__ else ".")
 
-import utime
 from allocation import borrowed, grown, locked
 from dmp_bus import OUT, make
-from upright import dmp as mpu_dmp
-
-# The simulator's clock allocates, outside of everybody's count; here it is to be the port's own.
-mpu_dmp.time = utime
 
 TICKS = 10_000
 

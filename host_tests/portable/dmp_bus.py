@@ -101,7 +101,7 @@ class Bus:
 def make(version, axes=("x", "y", "z"), rate=200):
     """(bus, dmp), configured; version: 0 for v6.12, 1 for v2.0."""
     bus = Bus((28, 42)[version])
-    dmp = MpuDmp(MPU6050(bus), IMAGES[version], rate, accept_unknown=True, axes=axes)
+    dmp = MpuDmp(MPU6050(bus, 0x68), IMAGES[version], rate, accept_unknown=True, axes=axes)
     dmp.configure()
     return bus, dmp
 

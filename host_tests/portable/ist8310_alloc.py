@@ -115,7 +115,7 @@ class Ticks:
     def __init__(self, faults):
         self.bus = Registers()
         self.faults = faults
-        self.imu = MPU6050(self.bus)
+        self.imu = MPU6050(self.bus, 0x68)
         self.imu.configure(sample_rate_hz=1000, settle=False)
         self.aux = AuxiliaryBus(self.imu)
         self.mag = IST8310(self.aux)

@@ -75,7 +75,7 @@ class Registers:
 class Ticks:
     def __init__(self, faults):
         self.bus = Registers()
-        self.imu = MPU6050(self.bus)
+        self.imu = MPU6050(self.bus, 0x68)
         self.imu.configure(sample_rate_hz=1000, settle=False)
         self.faults = faults
         self.fresh = 0

@@ -121,7 +121,7 @@ class FloatFilter(Mahony6):
 
 def build(kind):
     bus = Bus()
-    imu = MPU6050(bus)
+    imu = MPU6050(bus, 0x68)
     imu.configure(settle=False)
     filter = kind(1000, imu.gyro_scale, imu.accel_lsb_per_g, 0.5, 0.01)
     display = SSD1306(bus)

@@ -9,14 +9,17 @@ from micropython import const
 
 from upright.dmp_image import MpuDmpError
 from upright.dmp_setup import MpuDmpSetup
-from upright.mpu_common import HEALTH_OK
+from upright.mpu import Mpu
+from upright.mpu_monitor import HEALTH_OK
 
 _DMP_EN = const(0x80)  # USER_CTRL
+_FIFO_EN = const(0x40)
+_HEAD = const(2)  # bytes of the FIFO's buffer before the first packet
 _COUNT_MASK = const(0x3FFFFFFF)
 _SAME_FRACTION = const(8)  # polls in a row that find the same part of a packet: none is on its way
 _HOPELESS = const(16)  # misaligned packets in a row
 
-# Words of `state`, see mpu_dmp_setup.py
+# Words of `state`, see dmp_setup.py
 _PROBE = const(0)
 _Q = const(1)
 _Q30 = const(5)
@@ -168,13 +171,13 @@ class MpuDmp(MpuDmpSetup):
         """
         if self._off:
             self.stale = (self.stale + 1) & _COUNT_MASK
-            return self._imu._not_fresh()
+            return self._monitor.not_fresh()
         return self._fetch()
 
     def health(self):
         """The driver's health(), one register a call; and has the DMP fallen silent, or lost its memory?
 
-        Returns a HEALTH_ state of mpu_common. Sets needs_reload.
+        Returns a HEALTH_ state of mpu_monitor. Sets needs_reload.
         """
         if self._loading:
             return HEALTH_OK
@@ -183,8 +186,7 @@ class MpuDmp(MpuDmpSetup):
         if imu.resets != self._resets:
             self._resets = imu.resets
             # the repair that has begun is not to start a program that is gone
-            imu._user_ctrl &= ~_DMP_EN
-            imu._values[len(imu._values) - 1] = imu._user_ctrl
+            imu.table.change_last(0, _DMP_EN | _FIFO_EN)
             self._lost()
         elif self._silent and not self._off:
             self.stalls = (self.stalls + 1) & _COUNT_MASK
@@ -201,14 +203,15 @@ class MpuDmp(MpuDmpSetup):
 
     @micropython.native
     def _fetch(self):
-        imu = self._imu
-        if imu._dirty:
-            imu._fifo_restart()
+        fifo = self.fifo
+        monitor = self._monitor
+        if monitor.fifo_misaligned:
+            fifo.restart()
             self._seen_ms = time.ticks_ms()
-            return imu._not_fresh()
-        level = imu._fifo_bytes()
+            return monitor.not_fresh()
+        level = fifo.bytes_waiting()
         n = level // self._packet
-        imu.fifo_level = n
+        fifo.level = n
         if not n:
             return self._none()
         self._seen_ms = time.ticks_ms()
@@ -216,14 +219,14 @@ class MpuDmp(MpuDmpSetup):
         if level and n < self._full:
             return self._partial(level)
         self._fractions = 0
-        if n > self._batch_max:
-            n = self._batch_max
-        if not imu._fifo_drain(n, level):
-            return imu._not_fresh()
-        imu._pending = 0
-        flags = _parse(imu._batch, (n - 1) * self._packet, self._s, self.counts)
+        if n > fifo.batch:
+            n = fifo.batch
+        if not fifo.drain(n, level):
+            return monitor.not_fresh()
+        fifo.take_all()
+        flags = _parse(fifo.buffer, _HEAD + (n - 1) * self._packet, self._s, self.counts)
         if flags < 0:
-            imu.fifo_lost = (imu.fifo_lost + n) & _COUNT_MASK
+            fifo.lose(n)
             self._bad += 1
             if self._bad > _HOPELESS:
                 self._silent = 1
@@ -236,10 +239,10 @@ class MpuDmp(MpuDmpSetup):
 
     def _none(self):
         self.stale = (self.stale + 1) & _COUNT_MASK
-        self._imu._suspect = 1
+        self._monitor.doubt()
         if time.ticks_diff(time.ticks_ms(), self._seen_ms) > self._silent_ms:
             self._silent = 1
-        return self._imu._not_fresh()
+        return self._monitor.not_fresh()
 
     def _partial(self, fraction):
         """Part of a packet is left: one that is being written, or the first has lost its beginning. Wait for the next
@@ -250,14 +253,14 @@ class MpuDmp(MpuDmpSetup):
             self._fractions = 0
         self._fractions += 1
         if self._fractions < _SAME_FRACTION:
-            return self._imu._not_fresh()
+            return self._monitor.not_fresh()
         self._fractions = 0
         return self._misaligned()
 
     def _misaligned(self):
         self.misaligned = (self.misaligned + 1) & _COUNT_MASK
-        self._imu._dirty = 1  # the next call restarts the FIFO
-        return self._imu._not_fresh()
+        self._monitor.fifo_misaligned = 1  # the next call restarts the FIFO
+        return self._monitor.not_fresh()
 
     # -- as a filter
 
@@ -308,19 +311,24 @@ class MpuDmp(MpuDmpSetup):
 
     @property
     def fifo_overflows(self):
-        return self._imu.fifo_overflows
+        return self.fifo.overflows
 
     @property
     def fifo_resets(self):
-        return self._imu.fifo_resets
+        return self.fifo.resets
 
     @property
     def fifo_lost(self):
-        return self._imu.fifo_lost
+        return self.fifo.lost
 
     @property
     def fifo_level(self):
-        return self._imu.fifo_level
+        return self.fifo.level
+
+    # floats, for programs
+    accel = Mpu.accel
+    gyro = Mpu.gyro
+    temperature = Mpu.temperature
 
     def temperature_cdeg(self):
         """The temperature at the time of configure() in hundredths of a degC."""

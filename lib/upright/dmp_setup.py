@@ -1,5 +1,5 @@
 # The set-up half of the DMP's driver: loading an image, starting it, judging whether it runs.
-# Needs a driver (mpu6050.py, mpu6500.py), mpu_dmp_image.py and fixmath.py; mpu_dmp.py has the tick. Runs on
+# Needs a driver (mpu6050.py, mpu6500.py), dmp_image.py, attitude.py and fixmath.py; dmp.py has the tick. Runs on
 # MicroPython >= 1.22 and under CPython with a `micropython` shim.
 
 import math
@@ -11,6 +11,7 @@ from micropython import const
 from upright import fixmath
 from upright.attitude import Attitude
 from upright.dmp_image import DIVIDER, KNOWN, DmpImage, MpuDmpError
+from upright.mpu_fifo import Fifo
 
 # Registers, by their names in InvenSense's motion driver 6.12 (inv_mpu.c); not in RM-MPU-6000A
 _BANK_SEL = const(0x6D)  # MEM_START_ADDR 0x6E follows: one write of two bytes sets both
@@ -25,11 +26,12 @@ _FIFO_EN = const(0x40)
 _DMP_RESET = const(0x08)
 _READY_AND_OVERFLOW = const(0x11)  # INT_ENABLE: DATA_RDY, FIFO_OFLOW
 
+_HEAD = const(2)  # bytes of the FIFO's buffer before the first packet
 _BASE_HZ = const(200)  # the images are made for this sample rate
 _ORDERLY = const(4)  # packets that the start-up check wants to see
 _COUNT_MASK = const(0x3FFFFFFF)
 
-# Words of `state`; mpu_dmp.py uses the same
+# Words of `state`; dmp.py uses the same
 _PROBE = const(0)  # always -1: viper's ptr32 zero-extends on 64-bit ports
 _Q = const(1)  # w x y z, body to earth, Q29
 _Q30 = const(5)  # the same as the packet has it, chip to earth, Q30
@@ -43,7 +45,7 @@ _STATE_WORDS = const(30)
 
 
 class MpuDmpSetup(Attitude):
-    """What may wait, allocate and raise; mpu_dmp.MpuDmp adds what the tick calls."""
+    """What may wait, allocate and raise; dmp.MpuDmp adds what the tick calls."""
 
     def __init__(
         self,
@@ -57,6 +59,7 @@ class MpuDmpSetup(Attitude):
     ):
         self._divider = _divider(rate_hz)
         self._imu = imu
+        self._monitor = imu.monitor
         self.rate = self.sample_rate = (rate_hz, 1)
         self.gyro_scale = (82, 5)
         self.accel_range_g = 2
@@ -72,15 +75,14 @@ class MpuDmpSetup(Attitude):
         self._set_yaw(32768, 0)
         self.image = image = DmpImage(image, known, accept_unknown)
         self.version = image.version
-        self._packet = image.packet
+        self.fifo = Fifo(imu.registers, imu.table, imu.monitor, imu.counts)
+        self.fifo.packet = self._packet = image.packet
         self.accel_lsb_per_g = image.accel_lsb_per_g
         s[_ACCEL] = image.accel_at
         s[_GYRO] = image.gyro_at
         s[_STEP] = image.step
         s[_FULL] = image.accel_full
-        if not isinstance(batch, int) or not 1 <= batch <= 512 // self._packet:
-            raise ValueError("batch %r is not 1 to %d" % (batch, 512 // self._packet))
-        self._batch_max = batch
+        self.fifo.prepare(batch)
         self.stale = 0
         self.skipped = 0
         self.misaligned = 0
@@ -133,21 +135,17 @@ class MpuDmpSetup(Attitude):
         )  # packets have no temperature: it stays as it was now
         self.counts[9] = ((two[0] << 8 | two[1]) ^ 0x8000) - 0x8000
         self._load()
-        whole = memoryview(bytearray(self._batch_max * self._packet))
-        imu._batch = whole
-        imu._views = [whole[: n * self._packet] for n in range(self._batch_max + 1)]
+        self.fifo.size = imu.fifo_size
         self._full = imu.fifo_size // self._packet  # packets in a FIFO that overflows next
-        imu._batch_max = 0  # the driver's own FIFO mode would need another one
         start = self.image.program_start
-        imu._set_row(_INT_ENABLE, _READY_AND_OVERFLOW)
+        imu.table.set(_INT_ENABLE, _READY_AND_OVERFLOW)
         self._write(_PRGM_START_H, bytes((start >> 8, start & 0xFF)))
-        imu.write_register(_USER_CTRL, imu._user_ctrl | _DMP_RESET)
+        imu.write_register(_USER_CTRL, imu.table.last() | _DMP_RESET)
         time.sleep_ms(50)  # as the motion driver (mpu_reset_fifo)
         imu.set_user_ctrl(_DMP_EN, _DMP_EN)
-        imu._values[len(imu._values) - 1] |= _FIFO_EN
-        imu._dirty = 1
-        imu._fifo_restart()
-        if imu._dirty:
+        imu.table.change_last(_FIFO_EN, _FIFO_EN)
+        imu.monitor.fifo_misaligned = 1
+        if not self.fifo.restart():
             raise MpuDmpError("the bus failed while the DMP was started")
         self._resets = imu.resets
         self._set_yaw(32768, 0)
@@ -220,10 +218,10 @@ class MpuDmpSetup(Attitude):
             time.sleep_ms(1)
             if self._fetch() & 1:
                 good += 1
-                packet = bytes(self._imu._views[1])
+                packet = bytes(self.fifo.buffer[_HEAD : _HEAD + self._packet])
                 same = same and before in (None, packet)
                 before = packet
-            most = max(most, self._imu.fifo_level)
+            most = max(most, self.fifo.level)
         self.stale = stale
         if good >= _ORDERLY and not same:
             return

@@ -1,109 +1,134 @@
 # Driver of the InvenSense MPU6050 on I2C, and of the parts that are sold under its name.
-# Needs an I2C object (machine.I2C or alike) and mpu_common.py. Runs on MicroPython >= 1.22 and under
-# CPython with a `micropython` shim. RM is RM-MPU-6000A rev 4.2, PS PS-MPU-6000A rev 3.4.
+# Needs an I2C object (machine.I2C or alike), mpu.py with its parts, and registers.py. Runs on MicroPython >= 1.22
+# and under CPython with a `micropython` shim. RM is RM-MPU-6000A rev 4.2.
 
 import time
 
 from micropython import const
 
 from upright import mpu_parts
-from upright.mpu_common import (  # noqa: F401  the health states are part of this module's face
+from upright.mpu import Mpu
+from upright.mpu_monitor import (  # noqa: F401  the health states are part of this module's face
     HEALTH_BUS_ERROR,
     HEALTH_MISMATCH,
     HEALTH_OK,
     HEALTH_REPAIRING,
-    MpuBase,
 )
 from upright.registers import I2CRegisters
 
 _WHO_AM_I = const(0x75)
+_ADDRESSES = (0x68, 0x69)  # with AD0 low, high
+_CLOCK = "A DS1307 or DS3231 clock has the address 0x68, too"
 
 
 class MPU6050Error(OSError):
     """The chip is absent, another one, or does not keep what is written to it; at set-up only."""
 
 
-class MPU6050(MpuBase):
-    """An MPU6050 on an I2C bus.
+class I2CPort:
+    """How a chip of the family is found on an I2C bus; see mpu.Mpu."""
 
-    i2c             has readfrom_mem_into and writeto; give machine.I2C a short timeout, for a stuck
-                    bus blocks the tick as long
-    address         0x68 with AD0 low, 0x69 with AD0 high
-    accept_unknown  take a part whose identity is not in the table for an MPU6050
+    interface = 0
+    after_reset = ()
 
-    Constructing touches no bus. configure() finds, resets and starts the chip; then, in a timer's
-    or a pin's interrupt, read() fills counts (ax ay az gx gy gz mx my mz temp flags), health() looks
-    after the configuration, and fifo_poll() with fifo_next() take the place of read() in FIFO mode:
-
-        imu = MPU6050(i2c)
-        imu.configure(accel_range_g=8, gyro_range_dps=2000, sample_rate_hz=200)
-
-        def tick(timer):
-            if imu.read() & 1:
-                ...  # a new sample in imu.counts
-            imu.health()
-
-    Counters, wrapping at 2**30: errors (bus faults), stale (read() found nothing new), resets (of
-    the chip by itself), fifo_overflows, fifo_resets, fifo_lost (packets, as far as they could be
-    counted). chip is the part's name, who_am_i its identity.
-    """
-
-    error_class = MPU6050Error
-    _NAME = "MPU6050"
-    _ONLY_6500 = False
-
-    def __init__(self, i2c, address=0x68, accept_unknown=False):
-        MpuBase.__init__(self, I2CRegisters(i2c, address, self.error_class, mpu_parts.name))
-        self._i2c = i2c
+    def __init__(self, i2c, address, accept_unknown, error_class, name, only_6500):
+        self.registers = I2CRegisters(
+            i2c, _ADDRESSES[0] if address is None else address, error_class, mpu_parts.name
+        )
+        self._error_class = error_class
+        self._search = address is None
         self._accept_unknown = accept_unknown
+        self._name = name
+        self._only_6500 = only_6500
 
-    # Set-up
+    @property
+    def where(self):
+        return f"at 0x{self.registers.address:02x}"
 
-    def _begin(self):
-        self._identify()
-        self._reset(f"at 0x{self.registers.address:02x}")
-        self._identify()
+    def prepare(self):
+        pass
 
-    def _identify(self):
-        who = None
+    def find(self):
+        answers = {}
         for _ in range(11):
-            who = self._who_is_at(self.registers.address)
-            if who is not None:
+            answers = self._ask(_ADDRESSES if self._search else (self.registers.address,))
+            if any(self._is_wanted(who) for who in answers.values()):
+                break
+            if answers and not self._search:
                 break
             time.sleep_ms(10)  # just powered up, the chip may take 100 ms to answer
-        if who is None:
-            raise self.error_class(self._absent())
+        if not answers:
+            raise self._error_class(self._absent())
+        wanted = [address for address in sorted(answers) if self._is_wanted(answers[address])]
+        if len(wanted) > 1:
+            raise self._error_class(
+                f"0x68 answers WHO_AM_I (0x75) with 0x{answers[0x68]:02x} and 0x69 with "
+                f"0x{answers[0x69]:02x}: say which one is meant, address=0x68 or address=0x69"
+            )
+        self.registers.address = address = (wanted or sorted(answers))[0]
+        return answers[address], self._part(answers[address])
+
+    def _is_wanted(self, who):
+        return who in mpu_parts.PARTS or self._accept_unknown
+
+    def _part(self, who):
+        where = f"0x{self.registers.address:02x}"
         part = mpu_parts.PARTS.get(who)
         if part is None:
             if not self._accept_unknown:
-                known = ", ".join(f"0x{k:02x}" for k in sorted(mpu_parts.PARTS))
-                raise self.error_class(
-                    f"0x{self.registers.address:02x} answers WHO_AM_I (0x75) with 0x{who:02x}; known are "
-                    f"{known}. A DS1307 or DS3231 clock has the same address. "
-                    f"accept_unknown=True uses it as an {self._NAME}"
+                raise self._error_class(
+                    f"{where} answers WHO_AM_I (0x75) with 0x{who:02x}; known are {mpu_parts.known()}. "
+                    f"{_CLOCK}. accept_unknown=True uses it as an {self._name}"
                 )
-            as_if = mpu_parts.PARTS[0x70 if self._ONLY_6500 else 0x68]
-            part = (f"unknown (0x{who:02x})",) + as_if[1:]
-        elif self._ONLY_6500 and not part[1]:
-            raise self.error_class(
-                f"0x{self.registers.address:02x} is an {part[0]} (0x{who:02x}), not of the MPU6500 family: "
+            return mpu_parts.unknown(who, self._only_6500)
+        if self._only_6500 and not part[1]:
+            raise self._error_class(
+                f"{where} is an {part[0]} (0x{who:02x}), not of the MPU6500 family: "
                 "use MPU6050, which drives both"
             )
-        self._adopt(who, part)
+        return part
 
-    def _who_is_at(self, address):
-        registers = I2CRegisters(self._i2c, address)
-        try:
-            registers.read_into(_WHO_AM_I, self._one)
-        except OSError:
-            return None
-        return self._one[0]
+    def _ask(self, addresses):
+        """{address: WHO_AM_I} of those that answer."""
+        answers = {}
+        there = self.registers.address
+        byte = bytearray(1)
+        for address in addresses:
+            self.registers.address = address
+            try:
+                self.registers.read_into(_WHO_AM_I, byte)
+                answers[address] = byte[0]
+            except OSError:
+                pass
+        self.registers.address = there
+        return answers
 
     def _absent(self):
-        other = 0x69 if self.registers.address == 0x68 else 0x68
-        who = self._who_is_at(other)
-        if who is None:
-            hint = f"none at 0x{other:02x} either. Check supply, SDA, SCL and their pull-ups"
+        tried = "(WHO_AM_I: no answer to 11 reads in 0.1 s)"
+        check = "Check supply, SDA, SCL and their pull-ups"
+        if self._search:
+            return f"no {self._name} at 0x68 or 0x69; {check} {tried}"
+        address = self.registers.address
+        other = 0x69 if address == 0x68 else 0x68
+        answers = self._ask((other,))
+        if answers:
+            hint = (
+                f"0x{other:02x} answers, with 0x{answers[other]:02x}. "
+                "AD0 sets the address: low 0x68, high 0x69"
+            )
         else:
-            hint = f"0x{other:02x} answers, with 0x{who:02x}. AD0 sets the address: low 0x68, high 0x69"
-        return f"no {self._NAME} at 0x{self.registers.address:02x}; {hint} (WHO_AM_I: no answer to 11 reads in 0.1 s)"
+            hint = f"none at 0x{other:02x} either. {check}"
+        return f"no {self._name} at 0x{address:02x}; {hint} {tried}"
+
+
+class MPU6050(Mpu):
+    """An MPU6050 on an I2C bus; what it can do says mpu.Mpu.
+
+    i2c             has readfrom_mem_into and writeto; give machine.I2C a short timeout, for a stuck
+                    bus blocks the tick as long
+    address         0x68 with AD0 low, 0x69 with AD0 high; None: whichever answers
+    accept_unknown  take a part whose identity is not in the table for an MPU6050 with a FIFO of 512 bytes
+    """
+
+    def __init__(self, i2c, address=None, accept_unknown=False):
+        Mpu.__init__(self, I2CPort(i2c, address, accept_unknown, MPU6050Error, "MPU6050", False))

@@ -1,5 +1,5 @@
 # Driver of the InvenSense MPU6500 on SPI, and of its family (MPU9250, ICM-20689 ...); on I2C as well.
-# Needs an SPI object and a chip select pin, mpu_common.py, mpu_parts.py, mpu6050.py. Runs on MicroPython
+# Needs an SPI object and a chip select pin, mpu.py with its parts, mpu6050.py and registers.py. Runs on MicroPython
 # >= 1.22 and under CPython with a `micropython` shim. PS is PS-MPU-6500A rev 1.3, RM RM-MPU-6500A rev 2.1.
 
 import time
@@ -7,13 +7,13 @@ import time
 from micropython import const
 
 from upright import mpu_parts
-from upright.mpu6050 import MPU6050
-from upright.mpu_common import (  # noqa: F401  the health states are part of this module's face
+from upright.mpu import Mpu
+from upright.mpu6050 import I2CPort
+from upright.mpu_monitor import (  # noqa: F401  the health states are part of this module's face
     HEALTH_BUS_ERROR,
     HEALTH_MISMATCH,
     HEALTH_OK,
     HEALTH_REPAIRING,
-    MpuBase,
 )
 from upright.registers import SPIRegisters
 
@@ -32,8 +32,57 @@ class MPU6500Error(OSError):
     """The chip is absent, another one, or does not keep what is written to it; at set-up only."""
 
 
-class MPU6500(MpuBase):
-    """An MPU6500 on an SPI bus of its own, in mode 0 or 3.
+class SPIPort:
+    """How a chip of the family is found on an SPI bus; see mpu.Mpu."""
+
+    where = "on SPI"
+    interface = _I2C_IF_DIS  # or a glitch on CS makes the chip an I2C slave
+    # RM 4.28: over SPI both H_RESET and SIGNAL_PATH_RESET, each followed by 100 ms
+    after_reset = ((_USER_CTRL, _I2C_IF_DIS), (_SIGNAL_PATH_RESET, 0x07))
+
+    def __init__(self, registers, accept_unknown):
+        self.registers = registers
+        self._accept_unknown = accept_unknown
+
+    def prepare(self):
+        self.registers.find_clocks()
+
+    def find(self):
+        who = 0
+        byte = bytearray(1)
+        for _ in range(11):
+            try:
+                self.registers.read_into(_WHO_AM_I, byte)
+                who = byte[0]
+            except OSError:
+                pass
+            if who not in (0x00, 0xFF):
+                break
+            time.sleep_ms(10)  # just powered up, the chip may take 100 ms to answer (PS 6.3)
+        else:
+            raise MPU6500Error(
+                f"no MPU6500 on SPI: WHO_AM_I (0x75) reads 0x{who:02x}, a floating bus (11 reads "
+                "in 0.1 s). Check supply, the pin of CS, MISO (AD0/SDO of the chip), SCK, and that "
+                "the bus is in mode 0 or 3"
+            )
+        part = mpu_parts.PARTS.get(who)
+        if part is None:
+            if not self._accept_unknown:
+                raise MPU6500Error(
+                    f"WHO_AM_I (0x75) reads 0x{who:02x} on SPI; known are {mpu_parts.known()}. A bus in "
+                    "mode 1 or 2 or over 1 MHz garbles it too. accept_unknown=True uses it as an MPU6500"
+                )
+            part = mpu_parts.unknown(who, True)
+        elif not part[1]:
+            raise MPU6500Error(
+                f"WHO_AM_I (0x75) reads 0x{who:02x} on SPI: an {part[0]}, which has no SPI, or an "
+                "MPU6000, which this driver does not know"
+            )
+        return who, part
+
+
+class MPU6500(Mpu):
+    """An MPU6500 on an SPI bus of its own, in mode 0 or 3; what it can do says mpu.Mpu.
 
     spi             has write, readinto and, to be clocked as below, init(baudrate=); a machine.SPI
     cs              chip select, an output pin, called with 0 and 1
@@ -45,102 +94,29 @@ class MPU6500(MpuBase):
     it saves, everything runs at slow_hz; where it cannot be set at all, at the clock that it was made
     with, which must then be 1 MHz or less. burst_hz says what came of it (0: as made).
 
-    Constructing touches no bus. configure() finds, resets and starts the chip (0.3 s); then, in a
-    timer's or a pin's interrupt, read() fills counts (ax ay az gx gy gz mx my mz temp flags), health()
-    looks after the configuration, and fifo_poll() with fifo_next() take the place of read() in FIFO
-    mode:
-
         imu = MPU6500(machine.SPI(5, 1_000_000), machine.Pin("PF6", machine.Pin.OUT, value=1))
         imu.configure(accel_range_g=8, gyro_range_dps=2000, sample_rate_hz=1000)
-
-        def tick(timer):
-            if imu.read() & 1:
-                ...  # a new sample in imu.counts
-            imu.health()
-
-    Counters, wrapping at 2**30: errors (what nobody drove on the bus; SPI has no acknowledge), stale
-    (read() found nothing new), resets (of the chip by itself), fifo_overflows, fifo_resets, fifo_lost
-    (packets, as far as they could be counted). chip is the part's name, who_am_i its identity.
     """
-
-    error_class = MPU6500Error
-    _INTERFACE = _I2C_IF_DIS  # or a glitch on CS makes the chip an I2C slave
 
     def __init__(self, spi, cs, accept_unknown=False, fast_hz=10_000_000, slow_hz=_REGISTER_HZ):
         if not 0 < slow_hz <= _REGISTER_HZ:
             raise ValueError(f"slow_hz {slow_hz!r} is not 1 to {_REGISTER_HZ}")
         if not slow_hz <= fast_hz <= _SENSOR_HZ:
             raise ValueError(f"fast_hz {fast_hz!r} is not {slow_hz} to {_SENSOR_HZ}")
-        MpuBase.__init__(
-            self,
-            SPIRegisters(
-                spi,
-                cs,
-                fast_hz,
-                slow_hz,
-                (_INT_STATUS, _EXT_SENS_DATA_23),  # not FIFO_R_W: no sensor register
-                self.error_class,
-                mpu_parts.name,
-            ),
-        )
-        self._accept_unknown = accept_unknown
+        sensor = (_INT_STATUS, _EXT_SENS_DATA_23)  # FIFO_R_W is no sensor register
+        registers = SPIRegisters(spi, cs, fast_hz, slow_hz, sensor, MPU6500Error, mpu_parts.name)
+        Mpu.__init__(self, SPIPort(registers, accept_unknown))
 
     @property
     def burst_hz(self):
         return self.registers.burst_hz
 
-    # Set-up
 
-    def _begin(self):
-        self.registers.find_clocks()
-        self._identify()
-        # RM 4.28: over SPI both H_RESET and SIGNAL_PATH_RESET, each followed by 100 ms
-        self._reset("on SPI")
-        self.registers.write_register(_USER_CTRL, _I2C_IF_DIS)
-        self.registers.write_register(_SIGNAL_PATH_RESET, 0x07)
-        time.sleep_ms(100)
-        self._identify()
-
-    def _identify(self):
-        who = 0
-        for _ in range(11):
-            try:
-                self._read_into(_WHO_AM_I, self._one)
-                who = self._one[0]
-            except OSError:
-                pass
-            if who not in (0x00, 0xFF):
-                break
-            time.sleep_ms(10)  # just powered up, the chip may take 100 ms to answer (PS 6.3)
-        else:
-            raise MPU6500Error(
-                f"no MPU6500 on SPI: WHO_AM_I (0x75) reads 0x{who:02x}, as nobody drives it (11 reads "
-                "in 0.1 s). Check supply, the pin of CS, MISO (AD0/SDO of the chip), SCK, and that "
-                "the bus is in mode 0 or 3"
-            )
-        part = mpu_parts.PARTS.get(who)
-        if part is None:
-            if not self._accept_unknown:
-                known = ", ".join(f"0x{k:02x}" for k in sorted(mpu_parts.PARTS))
-                raise MPU6500Error(
-                    f"WHO_AM_I (0x75) reads 0x{who:02x} on SPI; known are {known}. A bus in mode 1 or "
-                    "2 or over 1 MHz garbles it too. accept_unknown=True uses it as an MPU6500"
-                )
-            part = (f"unknown (0x{who:02x})",) + mpu_parts.PARTS[0x70][1:]
-        elif not part[1]:
-            raise MPU6500Error(
-                f"WHO_AM_I (0x75) reads 0x{who:02x} on SPI: an {part[0]}, which has no SPI, or an "
-                "MPU6000, which this driver does not know"
-            )
-        self._adopt(who, part)
-
-
-class MPU6500_I2C(MPU6050):
+class MPU6500_I2C(Mpu):
     """An MPU6500, or another part of its family, on an I2C bus: MPU6050 that takes nothing else.
 
     i2c, address, accept_unknown  as for MPU6050; an unknown part is taken for an MPU6500
     """
 
-    error_class = MPU6500Error
-    _NAME = "MPU6500"
-    _ONLY_6500 = True
+    def __init__(self, i2c, address=None, accept_unknown=False):
+        Mpu.__init__(self, I2CPort(i2c, address, accept_unknown, MPU6500Error, "MPU6500", True))

@@ -85,6 +85,16 @@ def name(register):
     return f"{known} (0x{register:02x})"
 
 
+def known():
+    """Every WHO_AM_I of the table, for a message."""
+    return ", ".join(f"0x{who:02x}" for who in sorted(PARTS))
+
+
+def unknown(who, family_6500):
+    """A row for a part that is not in the table: taken for the smallest of the family."""
+    return f"unknown (0x{who:02x})", family_6500, 512, _T_6500 if family_6500 else T_6050
+
+
 def index(what, value, allowed):
     """Place of value in allowed; raises ValueError, naming all."""
     for i in range(len(allowed)):
@@ -129,7 +139,7 @@ def divider(base_hz, rate):
 class Filters:
     """The digital low-pass filters and the sample rate of one part, checked and as register values.
 
-    dlpf, accel_dlpf  as in MpuBase.configure(); None: the widest of the gyro's that stays within half
+    dlpf, accel_dlpf  as in Mpu.configure(); None: the widest of the gyro's that stays within half
                       the sample rate, and the accelerometer's that follows the gyro's
     rate              (num, den) Hz
 

@@ -1,11 +1,11 @@
 # The self-tests of the MPU6050 and of the MPU6500 family; imported when one is run.
-# Needs mpu_common.py and a driver built on it. Runs on MicroPython >= 1.22 and under CPython with a
-# `micropython` shim. RM is RM-MPU-6000A rev 4.2, AN AN-MPU-9250A-03 rev 1.0, whose test the MPU6500 shares.
+# Needs mpu_fifo.py and a driver of mpu.py. Runs on MicroPython >= 1.22 and under CPython with a `micropython` shim.
+# RM is RM-MPU-6000A rev 4.2, AN AN-MPU-9250A-03 rev 1.0, whose test the MPU6500 shares.
 
 import time
 from array import array
 
-from upright.mpu_common import unpack
+from upright.mpu_fifo import unpack
 
 _SMPLRT_DIV = 0x19
 _CONFIG = 0x1A
@@ -20,11 +20,8 @@ _PRECISION = 16  # trims are in LSB times 2**16
 
 
 def run(imu):
-    """(passed, changes) of a configured driver; see MpuBase.self_test()."""
-    try:
-        passed, changes = _test_6500(imu) if imu.family_6500 else _test_6050(imu)
-    finally:
-        imu._resume()
+    """(passed, changes), as Mpu.self_test() returns them, of a configured driver that has stopped FIFO and master."""
+    passed, changes = _test_6500(imu) if imu.family_6500 else _test_6050(imu)
     return passed, tuple(changes)
 
 
@@ -103,7 +100,6 @@ def _changes(rest, moved, samples, trims):
 def _responses(imu, ranges, samples):
     """Sums of `samples` at rest and of as many with the actuators on; ranges: bits of ACCEL_CONFIG."""
     steps = ((_FIFO_EN, 0), (_SMPLRT_DIV, 0), (_CONFIG, 2), (_PWR_MGMT_1, 1))
-    imu._stop()
     for register, value in steps:
         imu.write_register(register, value)
     if imu.family_6500:
@@ -118,17 +114,19 @@ def _sums(imu, actuators, ranges, samples):
     time.sleep_ms(50)  # the filters (92 Hz) and the proof masses come to rest; AN 3 asks for 20 ms
     sums = [0] * 6
     counts = array("h", bytes(22))
-    raw = bytearray(15)
+    raw = bytearray(16)  # see unpack()
+    burst = memoryview(raw)[1:]
     for _ in range(samples):
         # a sample a millisecond; a chip that gives none is not waited for without end
         for _ in range(20):
             time.sleep_ms(1)
-            imu.registers.read_registers(_INT_STATUS, raw)
-            if raw[0] & 1:
+            imu.registers.read_registers(_INT_STATUS, burst)
+            if raw[1] & 1:
                 break
         else:
             raise imu.error_class("no sample in 20 ms during the self-test")
-        unpack(raw, 1, counts)
+        raw[1] = 1  # not what else INT_STATUS said
+        unpack(raw, 2, counts)
         for i in range(6):
             sums[i] += counts[i]
     return sums

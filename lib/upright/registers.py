@@ -83,18 +83,18 @@ class I2CRegisters(Registers):
 
     # The tick. writeto of a prebuilt buffer, as writeto_mem allocates on several ports.
 
-    @micropython.native
+    @micropython.viper
     def read_into(self, register, buffer):
         self._read(self.address, register, buffer)
 
-    @micropython.native
+    @micropython.viper
     def write(self, register, value):
         out = self._out
         out[0] = register
         out[1] = value
         self._send(self.address, out)
 
-    @micropython.native
+    @micropython.viper
     def write_from(self, buffer):
         self._send(self.address, buffer)
 

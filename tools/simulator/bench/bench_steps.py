@@ -126,7 +126,7 @@ display_bus = Bus()
 tick = None
 colour = 0
 if not FILTERS_ONLY:
-    imu = MPU6050(bus)
+    imu = MPU6050(bus, 0x68)
     imu.configure(8, 2000, sample_rate_hz=RATE)
     imu.read()
     turned = Calibration(("y", "-x", "z"), ("x", "y", "-z"), ACCEL_LSB_PER_G, GYRO_SCALE)

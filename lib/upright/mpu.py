@@ -1,0 +1,564 @@
+# The driver of the InvenSense MPU6050 family, put together from its parts: registers, table, monitor and FIFO.
+# Needs mpu_parts.py, mpu_table.py, mpu_monitor.py, mpu_fifo.py and a port from mpu6050.py or mpu6500.py. Runs on
+# MicroPython >= 1.22 and under CPython with a `micropython` shim. RM is RM-MPU-6000A rev 4.2, PS PS-MPU-6000A
+# rev 3.4, RM-6500 RM-MPU-6500A rev 2.1.
+
+import time
+from array import array
+
+import micropython
+from micropython import const
+
+from upright import mpu_parts
+from upright.mpu_fifo import Fifo, unpack
+from upright.mpu_monitor import Monitor
+from upright.mpu_table import RegisterTable
+
+_SMPLRT_DIV = const(0x19)
+_CONFIG = const(0x1A)
+_GYRO_CONFIG = const(0x1B)
+_ACCEL_CONFIG = const(0x1C)
+_ACCEL_CONFIG2 = const(0x1D)
+_FIFO_EN = const(0x23)
+_INT_PIN_CFG = const(0x37)
+_INT_ENABLE = const(0x38)
+_INT_STATUS = const(0x3A)
+_USER_CTRL = const(0x6A)
+_PWR_MGMT_1 = const(0x6B)
+_PWR_MGMT_2 = const(0x6C)
+_FIFO_COUNTH = const(0x72)
+
+_DATA_RDY = const(0x01)  # INT_STATUS and INT_ENABLE
+_FIFO_OFLOW = const(0x10)
+_NO_STATUS = const(0xA4)  # bits of INT_STATUS that no part of the family ever sets (RM 4.16)
+_FIFO_ENABLE = const(0x40)  # USER_CTRL.FIFO_EN
+_I2C_MST_EN = const(0x20)
+_SLV_CTRL = (0x27, 0x2A, 0x2D, 0x30, 0x34)  # I2C_SLV0_CTRL to I2C_SLV4_CTRL
+_FIFO_ALL = const(0xF8)  # FIFO_EN: TEMP, XG, YG, ZG, ACCEL
+_DEVICE_RESET = const(0x80)
+_SLEEP = const(0x40)
+_CLK_PLL = const(0x01)  # CLKSEL 1, PLL on the X gyro: RM 4.28 prefers it to the internal oscillator
+_MASTER_MS = const(5)  # in which the master ends 24 bytes and five addresses at the slowest clock
+_EXT_BYTES = const(24)  # EXT_SENS_DATA
+_PACKET = const(14)  # accel x y z, temperature, gyro x y z
+_HEAD = const(2)  # bytes before a packet, see unpack()
+
+# Until the zero-rate output has settled: PS 6.1; PS-MPU-6500A rev 1.3, table 1
+_GYRO_START_MS = const(30)
+_GYRO_START_6500_MS = const(35)
+
+_FLAGS = const(10)  # of counts
+_COUNT_MASK = const(0x3FFFFFFF)
+
+
+class Mpu:
+    """A chip of the family behind a port, which says how it is connected:
+
+        registers    I2CRegisters or SPIRegisters
+        interface    the bits of USER_CTRL that the bus wants: I2C_IF_DIS or none
+        after_reset  pairs (register, value) that follow DEVICE_RESET
+        where        for messages: "at 0x68"
+        prepare()    before the first access
+        find()       (WHO_AM_I, row of mpu_parts.PARTS); waits for the chip, raises the driver's own error
+
+    Constructing touches no bus. configure() finds, resets and starts the chip. Then, in a timer's or a pin's
+    interrupt, read() fills counts (ax ay az gx gy gz mx my mz temp flags) and health() looks after the configuration,
+    see mpu_monitor.Monitor; fifo_poll() and fifo_next(), see mpu_fifo.Fifo, take the place of read() in FIFO mode.
+
+        imu.configure(accel_range_g=8, gyro_range_dps=2000, sample_rate_hz=200)
+
+        def tick(timer):
+            if imu.read() & 1:
+                ...  # a new sample in imu.counts
+            imu.health()
+
+    In a program, accel(), gyro() and temperature() give the newest sample in g, deg/s and degC. As a context
+    manager (`with`) the driver puts the chip to sleep in the end; entering configures nothing.
+
+    Counters, wrapping at 2**30: errors (faults of the bus; on SPI what reads as a floating bus), stale (read() found
+    nothing new), resets (of the chip by itself), full_resets (by health(), when no samples came), fifo_overflows,
+    fifo_resets, fifo_lost (packets, as far as they could be counted). fifo_level is what the last poll left in the
+    chip. chip is the part's name, who_am_i its identity.
+
+    Set-up methods are not interrupt-safe: stop the tick first.
+    """
+
+    def __init__(self, port):
+        self.port = port
+        self.registers = registers = port.registers
+        self.error_class = registers.error_class
+        self.counts = counts = array("h", bytes(22))
+        self.stale = 0
+        self.chip = None
+        self.who_am_i = None
+        self.family_6500 = False
+        self.aux_device = None  # takes what comes behind the sample
+        self.table = RegisterTable(registers)
+        self.monitor = Monitor(registers, self.table, counts)
+        self.fifo = Fifo(registers, self.table, self.monitor, counts)
+        self._length_behind(0, 0)
+        self._temperature = mpu_parts.T_6050
+        self._begun = False
+        self._configured = False
+        # What every tick calls is looked up once, see mpu_monitor.Monitor.
+        self._read_into = registers.read_into
+        self.read = self.read
+        self.health = self.monitor.health
+        self.fifo_poll = self.fifo.poll
+        self.fifo_next = self.fifo.next
+
+    # The tick: nothing here allocates, waits, raises or uses a float. Native: half the time of bytecode.
+
+    @micropython.native
+    def read(self):
+        """Fetch the newest sample into counts; returns its flags (bit 0: fresh).
+
+        One burst from INT_STATUS on, so that DATA_RDY tells a new sample from one already read.
+        When there is none, or the bus fails, or the gyro has not settled after a repair, bit 0 is
+        clear and the words keep what they held.
+        """
+        raw = self._raw
+        try:
+            self._read_into(_INT_STATUS, self._burst)
+        except OSError:
+            return self.monitor.fault()
+        if self.monitor.state:
+            if self._is_sample(raw):
+                self.monitor.withhold()
+            return self.counts[_FLAGS]
+        counts = self.counts
+        flags = unpack(raw, _HEAD, counts)
+        if not flags:
+            if not self._is_sample(raw):
+                return counts[_FLAGS]
+            flags = unpack(raw, _HEAD, counts)
+        device = self.aux_device
+        if device is not None:
+            flags |= device.take(raw, _HEAD + _PACKET, counts)
+            counts[_FLAGS] = flags
+        return flags
+
+    def _is_sample(self, raw):
+        """Is there a new sample? Answers everything else that INT_STATUS says."""
+        status = raw[1]
+        raw[1] = 0xFF
+        if status & _NO_STATUS:  # a floating bus, or a transfer that did not fill the buffer
+            self.monitor.fault()
+            return False
+        if status & _FIFO_OFLOW:
+            self.monitor.fifo_misaligned = 1  # reading the flag has cleared it
+        if status & _DATA_RDY:
+            raw[1] = _DATA_RDY  # the rest is answered
+            return True
+        self.stale = (self.stale + 1) & _COUNT_MASK
+        self.monitor.no_sample(raw)
+        return False
+
+    def temperature_cdeg(self):
+        """Temperature of the newest sample in hundredths of a degC, by the formula of the part."""
+        mul, div, offset = self._temperature
+        return (self.counts[9] * mul + (div >> 1)) // div + offset
+
+    def bus_fault(self):
+        """Count a fault of the bus that somebody else has met at this chip, and have health() look at it."""
+        self.monitor.fault()
+
+    # For programs: these allocate
+
+    def accel(self):
+        """(x, y, z) of the newest sample in g, in the chip's frame."""
+        counts, lsb = self.counts, self.accel_lsb_per_g
+        return counts[0] / lsb, counts[1] / lsb, counts[2] / lsb
+
+    def gyro(self):
+        """(x, y, z) of the newest sample in deg/s, in the chip's frame."""
+        counts, (num, den) = self.counts, self.gyro_scale
+        return counts[3] * den / num, counts[4] * den / num, counts[5] * den / num
+
+    def temperature(self):
+        """Temperature of the newest sample in degC."""
+        return self.temperature_cdeg() / 100
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, kind, error, traceback):
+        """FIFO off and asleep; a bus that fails is not to hide the exception that ends the block."""
+        if not self._configured:
+            return
+        try:
+            if self.fifo.on:
+                self.fifo_disable()
+            self.sleep()
+        except self.error_class:
+            if kind is None:
+                raise
+
+    # Set-up: may wait, allocate and raise
+
+    def configure(
+        self,
+        accel_range_g=8,
+        gyro_range_dps=2000,
+        dlpf=None,
+        sample_rate_hz=1000,
+        settle=True,
+        accel_dlpf=None,
+    ):
+        """Set the chip up and start it; finds and resets it first unless begin() has.
+
+        accel_range_g   2, 4, 8 or 16
+        gyro_range_dps  250, 500, 1000 or 2000
+        dlpf            DLPF_CFG 0..6: gyro bandwidth 256, 188, 98, 42, 20, 10, 5 Hz (RM 4.3; MPU6500
+                        250, 184, 92, 41, 20, 10, 5, RM-6500 4.5); None picks the widest that stays
+                        within half the sample rate. On the MPU6500 family also 7 (3600 Hz) and
+                        "bypass" (FCHOICE_B: 8800 Hz, a sample every 31 us, for read() only)
+        sample_rate_hz  int or (num, den): 1000 Hz divided by 1 to 256, the nearest of these when it
+                        lies within 0.5 %. With dlpf 0 8000 Hz takes the place of 1000, with 7 too;
+                        there the MPU6500 family cannot divide; with "bypass" 32000 only
+        settle          wait for the gyro's start-up and the filter (from 34 ms on)
+        accel_dlpf      MPU6500 family: A_DLPF_CFG 0..7, accelerometer bandwidth 460, 184, 92, 41, 20,
+                        10, 5, 460 Hz, or "bypass" (1130 Hz; RM-6500 4.8). None: as dlpf
+
+        Afterwards accel_lsb_per_g is an int, gyro_scale the exact LSB per deg/s as (num, den),
+        sample_rate the exact rate as (num, den) Hz; bandwidth_hz, accel_bandwidth_hz, dlpf,
+        accel_range_g and gyro_range_dps say what was set; FIFO mode is off, the INT pin gives pulses,
+        active high.
+
+        Raises ValueError for a setting that the part does not have, and the driver's own error for
+        a chip that is absent, is another one, or does not keep what was written to it.
+        """
+        self._configured = False
+        afs = mpu_parts.index("accel_range_g", accel_range_g, mpu_parts.ACCEL_RANGES)
+        fs = mpu_parts.index("gyro_range_dps", gyro_range_dps, mpu_parts.GYRO_RANGES)
+        rate = mpu_parts.ratio(sample_rate_hz)
+        if not self._begun:
+            self.begin()
+        filters = mpu_parts.Filters(self.chip, self.family_6500, dlpf, accel_dlpf, rate)
+
+        self.fifo.stop()
+        self.monitor.fifo_misaligned = 0
+        self.attach(None, 0)
+        rows = [
+            # awake first: the other registers keep what is written either way
+            (_PWR_MGMT_1, _CLK_PLL),
+            (_PWR_MGMT_2, 0),
+            (_SMPLRT_DIV, filters.smplrt_div),
+            (_CONFIG, filters.config),
+            (_GYRO_CONFIG, fs << 3 | filters.fchoice_b),
+            (_ACCEL_CONFIG, afs << 3),
+        ]
+        if self.family_6500:
+            rows.append((_ACCEL_CONFIG2, filters.accel_config2))
+        rows += [
+            # never INT_RD_CLEAR: any read would then wipe the FIFO overflow flag (RM 4.14)
+            (_INT_PIN_CFG, 0),
+            (_FIFO_EN, 0),
+            (_INT_ENABLE, _DATA_RDY),
+        ]
+        interface = self.port.interface
+        table = [(register, value, 0xFF) for register, value in rows]
+        # last: this is what starts the FIFO. RM-6500 4.27: I2C_IF_DIS clears itself
+        table.append((_USER_CTRL, interface, 0xFF & ~interface))
+        self.table.load(table)
+
+        self.accel_range_g = accel_range_g
+        self.gyro_range_dps = gyro_range_dps
+        self.dlpf = filters.dlpf
+        self.accel_dlpf = filters.accel_dlpf
+        self.bandwidth_hz = filters.bandwidth_hz
+        self.accel_bandwidth_hz = filters.accel_bandwidth_hz
+        self.accel_lsb_per_g = 16384 >> afs
+        self.gyro_scale = mpu_parts.GYRO_SCALES[fs]
+        self.sample_rate = num, den = filters.sample_rate
+        # the gyro's start-up, and four times the filter's delay: then its step response has died away
+        start_ms = _GYRO_START_6500_MS if self.family_6500 else _GYRO_START_MS
+        self.settle_ms = start_ms + 4 * filters.delay_ms
+        self._stop()
+        self.table.apply()
+        self.monitor.start(
+            self.port.after_reset,
+            interface,
+            1 + self.settle_ms * num // (1000 * den),
+            1000 * den // num,
+        )
+        self._configured = True
+        if settle:
+            self._settle()
+
+    def begin(self):
+        """Find the chip, check its identity, reset it (0.1 s). Raises the driver's own error."""
+        port = self.port
+        port.prepare()
+        self._adopt(port.find())
+        self._reset()
+        for register, value in port.after_reset:
+            self.write_register(register, value)
+        if port.after_reset:
+            time.sleep_ms(100)
+        self._adopt(port.find())
+        self._begun = True
+
+    def configure_interrupt(self, active_low=False, open_drain=False, latch=False):
+        """How the INT pin tells of a sample: a pulse of 50 us, or with latch a level until read()."""
+        self._need_configured()
+        value = (0x80 if active_low else 0) | (0x40 if open_drain else 0) | (0x20 if latch else 0)
+        self.table.set(_INT_PIN_CFG, value)
+
+    def fifo_enable(self, batch=8):
+        """Let the chip queue its samples; from now on drive it with fifo_poll() and fifo_next().
+
+        batch: packets (14 bytes, and what attach() adds) that one fifo_poll() fetches at most, in one
+        burst; 1 to what the FIFO holds.
+        """
+        self._need_configured()
+        if self.dlpf == "bypass":
+            raise ValueError("a FIFO that fills 32000 times a second cannot be read out")
+        self.fifo.prepare(batch)  # off until the chip is known to write packets of this length
+        self.monitor.fifo_misaligned = 1
+        self.table.set(_FIFO_EN, self._fifo_bits)
+        self.table.set(_INT_ENABLE, _DATA_RDY | _FIFO_OFLOW)
+        self.table.change_last(_FIFO_ENABLE, _FIFO_ENABLE)
+        if self.fifo.packet > _PACKET:
+            self._measure_packet()
+        if not self.fifo.restart():
+            raise self.error_class("the bus failed while the FIFO was started")
+        self.fifo.on = True
+
+    def fifo_disable(self):
+        """Back to read(). What the FIFO still holds is dropped."""
+        self._need_configured()
+        self.fifo.stop()
+        self.monitor.fifo_misaligned = 0
+        self.table.set(_USER_CTRL, self.table.last() & ~_FIFO_ENABLE)
+        self.table.set(_FIFO_EN, 0)
+        self.table.set(_INT_ENABLE, _DATA_RDY)
+
+    def self_test(self):
+        """Actuate the proof masses and judge the response, by the part's own formulas.
+
+        To be run at rest; takes 0.4 to 0.7 s. Returns (passed, changes): six ints for accel x y z and
+        gyro x y z, how far the response is off the factory's, in per mille, or None where the part
+        carries no factory value. passed is None when there is nothing to judge by.
+
+        MPU6050: within 14 % (PS 6.1, 6.2). MPU6500 family: gyro at least half, accelerometer half to
+        one and a half times the factory's, or absolute limits without one, and a gyro offset within 20
+        deg/s (AN-MPU-9250A-03). Needs mpu_selftest.py. Afterwards the configuration is as before.
+        Raises the driver's own error for a bus fault.
+        """
+        self._need_configured()
+        from upright import mpu_selftest  # only here: most programs never run it
+
+        try:
+            self._stop()
+            return mpu_selftest.run(self)
+        finally:
+            self._stop()
+            self.table.apply()
+            if self.fifo.on:
+                self.fifo.drop()
+            self._settle()
+
+    def sleep(self):
+        """Stop sampling (about 5 uA, PS 6.3) until wake(); the configuration stays."""
+        self._need_configured()
+        self.table.set(_PWR_MGMT_1, _CLK_PLL | _SLEEP)
+
+    def wake(self):
+        """Sample again, after the gyro's start-up time."""
+        self._need_configured()
+        self.table.set(_PWR_MGMT_1, _CLK_PLL)
+        self._settle()
+        if self.fifo.on:
+            self.fifo.drop()  # what came in while the gyro settled is not wanted
+
+    def configuration(self):
+        """The configuration as a list of (register, value), in the order in which it is written."""
+        return [row[:2] for row in self.table.rows()]
+
+    # Set-up for what works through this chip: a device on its auxiliary bus
+
+    def read_register(self, register):
+        """One register; raises error_class, naming it, when the bus fails."""
+        return self.registers.read_register(register)
+
+    def write_register(self, register, value):
+        """Write one register that health() is not to watch; raises error_class, naming it."""
+        self.registers.write_register(register, value)
+
+    def set_rows(self, rows):
+        """Configure registers and have health() watch them and a repair write them back.
+
+        rows: (register, value, mask), mask being the bits that are compared. They are written in this
+        order and read back; a register that the table has already keeps its place there, a new one
+        comes before USER_CTRL, which starts FIFO and master. configure() forgets them.
+
+        In FIFO mode what is in the FIFO is dropped; where the rows change what a slave reads, call
+        attach() again. Raises error_class for a bus fault and for a register that does not keep its
+        value.
+        """
+        self._need_configured()
+        if self.fifo.on:
+            self.fifo.drop()
+        self.table.merge(rows)
+
+    def set_user_ctrl(self, bits, mask):
+        """Change the bits of USER_CTRL that mask names, I2C_MST_EN (0x20) say, on the chip as well."""
+        self._need_configured()
+        self.table.change_last(bits, mask)
+        self.table.set(_USER_CTRL, self.table.last())
+
+    @property
+    def master_enabled(self):
+        """Is the auxiliary master to run, as set_user_ctrl() has it?"""
+        return bool(self.table.last() & _I2C_MST_EN)
+
+    def attach(self, device, length, fifo_en=0x01):
+        """Fetch EXT_SENS_DATA_00 and on, `length` bytes (0 to 24), in the same burst as the sample.
+
+        In FIFO mode they come behind the gyro in each packet: fifo_en names the slaves in FIFO_EN
+        (SLV0 0x01, SLV1 0x02, SLV2 0x04), which must be set up to read `length` bytes in all. device has
+
+            take(raw, at, counts)   called after a fresh sample: raw[at] to raw[at + length - 1] are its
+                                    bytes; fills counts[6] to counts[8], returns the flags to add: 2 or 0
+            health()                called by every second health() while the chip is in order
+
+        and neither may allocate or raise. attach(None, 0) ends it. In FIFO mode this starts the FIFO
+        anew, with fewer packets in a batch if it holds fewer; error_class is raised, and FIFO mode
+        over, if the packets turn out to have another length.
+        """
+        if not 0 <= length <= _EXT_BYTES:
+            raise ValueError(f"length {length!r} is not 0 to {_EXT_BYTES}")
+        if device is not None:
+            self._need_configured()
+        fifo = self.fifo
+        on = fifo.on
+        fifo.stop()
+        self._hand_on_to(None)  # never with buffers of another length
+        self._length_behind(length, fifo_en)
+        self._hand_on_to(device)
+        if on:
+            self.fifo_enable(min(fifo.batch, fifo.size // fifo.packet))
+
+    # Its parts
+
+    def _hand_on_to(self, device):
+        self.aux_device = self.fifo.device = None
+        self.monitor.attach(device)
+        self.aux_device = self.fifo.device = device
+
+    def _length_behind(self, length, fifo_en):
+        """Buffers for samples with so many bytes behind them."""
+        self.fifo.packet = _PACKET + length
+        self._fifo_bits = _FIFO_ALL | (fifo_en & 0x07 if length else 0)
+        self._raw = bytearray(_HEAD + _PACKET + length)  # see unpack(); raw[1] is INT_STATUS
+        self._burst = memoryview(self._raw)[_HEAD - 1 :]
+
+    def _measure_packet(self):
+        """Does a sample bring as many bytes as attach() was told? Raises error_class if not."""
+        wait_ms = 5 + 2000 * self.sample_rate[1] // self.sample_rate[0]
+        packet = self.fifo.packet
+        level = 0
+        two = bytearray(2)
+        for _ in range(3):
+            self.fifo.restart()
+            begun = time.ticks_ms()
+            level = 0
+            while level < packet and time.ticks_diff(time.ticks_ms(), begun) <= wait_ms:
+                self.registers.read_registers(_FIFO_COUNTH, two)
+                level = two[0] << 8 | two[1]
+            if level == packet:
+                return
+        raise self.error_class(
+            f"a sample does not put {packet} bytes into the FIFO (at the last look {level}): do "
+            "the slaves that attach() was told of read what it was told?"
+        )
+
+    def _adopt(self, found):
+        """Become the part that was found."""
+        self.who_am_i, part = found
+        self.monitor.who_am_i = self.who_am_i
+        self.chip, self.family_6500, self.fifo.size, self._temperature = part
+
+    def _reset(self):
+        """DEVICE_RESET, waited for; raises the driver's own error if it does not come to an end."""
+        registers = self.registers
+        for _ in range(3):
+            try:
+                self._stop()
+                registers.write(_PWR_MGMT_1, _DEVICE_RESET)
+                break
+            except OSError:
+                # perhaps the chip let go of the bus as it reset: once more is safe
+                time.sleep_ms(1)
+        time.sleep_ms(100)  # what the register maps ask for after DEVICE_RESET
+        for _ in range(10):
+            try:
+                if not registers.read_register(_PWR_MGMT_1) & _DEVICE_RESET:
+                    return
+            except OSError:
+                pass
+            # late after a slow supply ramp: the family's registers may take another 100 ms
+            time.sleep_ms(10)
+        raise self.error_class(f"chip {self.port.where} did not come out of reset")
+
+    def _stop(self):
+        """FIFO and auxiliary master off.
+
+        The master may be running even before the first configure(), since a reset of the board need
+        not be one of the chip. Cut off within a transaction (by the chip's reset, too) it would leave
+        the device on its bus hanging (RM-6500 4.33): it finishes what it began if its slots go first.
+        """
+        if self.read_register(_USER_CTRL) & _I2C_MST_EN:
+            for control in _SLV_CTRL:
+                self.write_register(control, 0)
+            time.sleep_ms(_MASTER_MS)
+        self.write_register(_USER_CTRL, self.port.interface)
+
+    def _settle(self):
+        time.sleep_ms(self.settle_ms)
+        self.registers.read_registers(_INT_STATUS, self._burst)  # drops what was ready meanwhile
+        self.monitor.heard()
+
+    def _need_configured(self):
+        if not self._configured:
+            raise self.error_class("configure() first")
+
+    # What the parts count
+
+    @property
+    def errors(self):
+        return self.monitor.errors
+
+    @property
+    def resets(self):
+        return self.monitor.resets
+
+    @property
+    def full_resets(self):
+        return self.monitor.full_resets
+
+    @property
+    def repair_calls(self):
+        """Calls of health() that a repair takes at most, from the first stale sample on, if the bus works."""
+        return self.monitor.repair_calls()
+
+    @property
+    def fifo_size(self):
+        return self.fifo.size
+
+    @property
+    def fifo_level(self):
+        return self.fifo.level
+
+    @property
+    def fifo_overflows(self):
+        return self.fifo.overflows
+
+    @property
+    def fifo_resets(self):
+        return self.fifo.resets
+
+    @property
+    def fifo_lost(self):
+        return self.fifo.lost

@@ -1,0 +1,248 @@
+# Packets of an MPU6050 or MPU6500: how a sample is unpacked, and the chip's FIFO, drained in whole packets.
+# Needs registers.py, mpu_table.py and mpu_monitor.py's objects. Runs on MicroPython >= 1.22 and under CPython with
+# a `micropython` shim. RM is RM-MPU-6000A rev 4.2.
+
+import micropython
+from micropython import const
+
+from upright.mpu_monitor import RESTORE
+
+_INT_STATUS = const(0x3A)
+_USER_CTRL = const(0x6A)
+_FIFO_COUNTH = const(0x72)
+_FIFO_R_W = const(0x74)
+
+_DATA_RDY = const(0x01)  # INT_STATUS and INT_ENABLE
+_FIFO_OFLOW = const(0x10)
+_NO_STATUS = const(0xA4)  # bits of INT_STATUS that no part of the family ever sets (RM 4.16)
+_FIFO_ENABLE = const(0x40)  # USER_CTRL
+_I2C_IF_DIS = const(0x10)
+_FIFO_RESET = const(0x04)
+
+_PACKET = const(14)  # accel x y z, temperature, gyro x y z
+_HEAD = const(2)  # bytes in front of the first packet of a buffer, see unpack()
+_FLAGS = const(10)  # of counts
+_COUNT_MASK = const(0x3FFFFFFF)
+
+
+@micropython.viper
+def unpack(buffer: ptr8, at: int, counts: ptr16) -> int:
+    """Big-endian accel, temperature, gyro at buffer[at..at+13] into counts; returns the flags.
+
+    The first packet stands at buffer[2], behind INT_STATUS: if that is not just DATA_RDY, this returns 0 and counts
+    stay. It is made 0xff, which is no status: a transfer that does not fill the buffer gives no sample. buffer[0]
+    is 1 once a poll has found no sample, and cleared here.
+    """
+    if at == 2:
+        if buffer[1] != 1:
+            return 0
+        buffer[1] = 0xFF
+    buffer[0] = 0
+    flags = 1
+    i = 0
+    while i < 6:
+        j = at + i + i
+        if i > 2:
+            j += 2  # past the temperature
+        # signed by arithmetic: viper stores the low 16 bits, CPython's array wants the number
+        word = ((buffer[j] << 8 | buffer[j + 1]) ^ 0x8000) - 0x8000
+        counts[i] = word
+        if word == 0x7FFF or word == -0x8000:
+            flags |= 4 if i < 3 else 8
+        i += 1
+    counts[9] = ((buffer[at + 6] << 8 | buffer[at + 7]) ^ 0x8000) - 0x8000
+    counts[10] = flags
+    return flags
+
+
+class Fifo:
+    """The FIFO of a chip, read in batches of whole packets.
+
+    size, packet  bytes of the FIFO and of a packet
+    on            True while the chip queues its samples
+    level         packets left in the chip at the last look
+    device        takes what comes behind each sample, or None
+
+    overflows, resets (restarts of the FIFO) and lost (packets, as far as they could be counted) are counters.
+    """
+
+    def __init__(self, registers, table, monitor, counts):
+        self.size = 512
+        self.packet = _PACKET
+        self.on = False
+        self.level = 0
+        self.overflows = 0
+        self.resets = 0
+        self.lost = 0
+        self.batch = 0  # packets that one poll fetches at most
+        self.device = None
+        self.buffer = bytearray(_HEAD)  # the packets of the batch, from 2 on
+        self._views = ()
+        self._full = 0  # packets from which on the FIFO counts as full
+        self._pending = 0  # packets of the batch not yet delivered
+        self._at = 0  # where the next one begins
+        self._table = table
+        self._monitor = monitor
+        self._counts = counts
+        self._byte = bytearray(1)
+        self._two = bytearray(2)
+        self._status = bytearray(1)
+        self._read_into = registers.read_into
+        self._write = registers.write
+        self.next = self.next  # for a quick look-up, see mpu_monitor.Monitor
+
+    # Set-up
+
+    def prepare(self, batch):
+        """Buffers for batches of so many packets. Raises ValueError for more than the FIFO holds."""
+        size = self.packet
+        if not isinstance(batch, int) or not 1 <= batch <= self.size // size:
+            raise ValueError(f"batch {batch!r} is not 1 to {self.size // size}")
+        self._full = self.size // size - 1
+        if len(self.buffer) != _HEAD + batch * size or batch != self.batch:
+            self.buffer = bytearray(_HEAD + batch * size)
+            whole = memoryview(self.buffer)
+            self._views = [whole[_HEAD : _HEAD + n * size] for n in range(batch + 1)]
+            self.batch = batch
+        self.stop()
+
+    def stop(self):
+        """Off; what the FIFO still holds is dropped."""
+        self.on = False
+        self._pending = self.level = 0
+
+    def drop(self):
+        """Forget what the FIFO holds: it is restarted before the next packet."""
+        self._pending = 0
+        self._monitor.fifo_misaligned = 1
+
+    # The tick: nothing below allocates, waits, raises or uses a float. Small functions for the reason told in
+    # mpu_monitor.py.
+
+    def poll(self):
+        """Fetch up to `batch` packets; returns how many next() has: 0 = none, or a fault.
+
+        The packets are given out only after a look at INT_STATUS that follows the burst: if the
+        FIFO overflowed at any time up to there, or the chip reset itself, or the bus failed, packet
+        boundaries are not certain any more; then the whole batch is dropped and the FIFO restarted.
+        """
+        if self._pending or not self.on or self._monitor.state >= RESTORE:
+            return self._pending
+        if self._monitor.fifo_misaligned:
+            self.restart()
+            return 0
+        level = self.bytes_waiting()
+        packets = level // self.packet
+        self.level = packets
+        if not packets:
+            self._monitor.no_sample(self.buffer)
+            return 0
+        # What came last is a whole packet, so where a fraction is left either the chip is writing one
+        # or the first has lost its beginning: wait, if need be until the FIFO is full, and drop all.
+        level -= packets * self.packet
+        if level and packets < self._full:
+            return 0
+        return self.drain(packets if packets < self.batch else self.batch, level)
+
+    @micropython.native
+    def next(self):
+        """Put the next packet of the batch into counts, as read() does; returns its flags, 0 when there is none."""
+        if not self._pending:
+            self._monitor.not_fresh()
+            return 0
+        at = self._at
+        self._at = at + self.packet
+        self._pending -= 1
+        if self._monitor.state:
+            return self._monitor.withhold()
+        counts = self._counts
+        flags = unpack(self.buffer, at, counts)
+        device = self.device
+        if device is not None:
+            flags |= device.take(self.buffer, at + _PACKET, counts)
+            counts[_FLAGS] = flags
+        return flags
+
+    def bytes_waiting(self):
+        """FIFO_COUNT; 0 also when the bus fails."""
+        try:
+            # high byte first: it latches the low (RM 4.30)
+            self._read_into(_FIFO_COUNTH, self._two)
+        except OSError:
+            self._monitor.fault()
+            return 0
+        level = self._two[0] << 8 | self._two[1]
+        if level <= self.size:
+            return level
+        self._monitor.fifo_misaligned = (
+            1  # a chip that dies in the middle leaves the bus high: 0xffff
+        )
+        self._monitor.fault()
+        return 0
+
+    def drain(self, n, fraction):
+        """Take n packets out, or none if they may not be whole ones."""
+        # until shown otherwise: an interrupted burst has taken part of a packet
+        self._monitor.fifo_misaligned = 1
+        if self._fetch(n) and not fraction:
+            self._monitor.fifo_misaligned = 0
+            self.level -= n
+            self._at = _HEAD
+            self.buffer[1] = _DATA_RDY  # for unpack()
+            self._pending = n
+            return n
+        if self._status[0] & _FIFO_OFLOW:
+            self.overflows = (self.overflows + 1) & _COUNT_MASK
+        self.lose(self.level)
+        self.level = 0
+        self.restart()
+        return 0
+
+    def take_all(self):
+        """The batch goes to somebody who unpacks it by himself."""
+        self._pending = 0
+
+    def lose(self, n):
+        """Count packets that nobody gets."""
+        self.lost = (self.lost + n) & _COUNT_MASK
+
+    def _fetch(self, n):
+        """Read n packets in one burst; 1 if nothing has shifted or replaced them up to its end."""
+        self._status[0] = 0
+        try:
+            self._read_into(_FIFO_R_W, self._views[n])
+            self._read_into(_INT_STATUS, self._status)
+            if self._status[0] & _NO_STATUS:
+                self._status[0] = 0
+                self._monitor.fault()
+                return 0
+            if self._status[0] & _FIFO_OFLOW:
+                return 0
+            # DATA_RDY since the last look proves that INT_ENABLE still holds, so that there was no
+            # reset. Without it ask: a FIFO that a reset has emptied repeats its last byte for ever.
+            if self._status[0] & _DATA_RDY:
+                return 1
+            self._read_into(_USER_CTRL, self._byte)
+        except OSError:
+            self._monitor.fault()
+            return 0
+        # the whole register: a chip that dies now leaves the bus high, 0xff
+        if (self._byte[0] ^ self._table.last()) & ~_I2C_IF_DIS == 0:
+            return 1
+        self._monitor.doubt()
+        return 0
+
+    def restart(self):
+        """Empty the FIFO; True if that worked. On the MPU6050 FIFO_RESET works only while FIFO_EN is 0 (RM 4.27)."""
+        user_ctrl = self._table.last() & ~_FIFO_ENABLE
+        try:
+            self._write(_USER_CTRL, user_ctrl)
+            self._write(_USER_CTRL, user_ctrl | _FIFO_RESET)
+            self._read_into(_INT_STATUS, self._byte)  # an overflow of the past
+            self._write(_USER_CTRL, user_ctrl | _FIFO_ENABLE)
+        except OSError:
+            self._monitor.fault()
+            return False
+        self._monitor.fifo_misaligned = 0
+        self.resets = (self.resets + 1) & _COUNT_MASK
+        return True

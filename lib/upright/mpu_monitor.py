@@ -1,0 +1,302 @@
+# Watches over the registers of an MPU6050 or MPU6500 in the tick and repairs what a reset of the chip has undone.
+# Needs registers.py and mpu_table.py's objects. Runs on MicroPython >= 1.22 and under CPython with a `micropython`
+# shim. RM is RM-MPU-6000A rev 4.2.
+
+import time
+
+import micropython
+from micropython import const
+
+# What health() answers
+HEALTH_OK = const(0)  # the register read back as written
+HEALTH_MISMATCH = const(1)  # it did not: the chip has reset itself; the next call begins the repair
+HEALTH_REPAIRING = const(2)  # the repair goes on
+HEALTH_BUS_ERROR = const(3)  # the bus failed; the same step is taken again next time
+
+# The state. Samples are delivered in WATCH only.
+WATCH = const(0)  # one row of the table is compared a call, in turn
+SETTLE = const(1)  # the same, while the gyro settles
+VERIFY = const(2)  # the rows have been written back; one a call is compared
+RESTORE = const(3)  # one row a call is written back
+RESET = const(4)  # a full reset of the chip, one step a call
+
+_USER_CTRL = const(0x6A)
+_PWR_MGMT_1 = const(0x6B)
+_WHO_AM_I = const(0x75)
+_FIFO_ENABLE = const(0x40)  # USER_CTRL.FIFO_EN
+_I2C_MST_EN = const(0x20)
+_DEVICE_RESET = const(0x80)
+_SLEEP = const(0x40)
+_SLV_CTRL = (0x27, 0x2A, 0x2D, 0x30, 0x34)  # I2C_SLV0_CTRL to I2C_SLV4_CTRL
+
+# Steps of a full reset are pairs of register and value; in place of a register:
+_WAIT = const(0)  # the value is a time in ms since the last write
+_RESET_MS = const(100)  # what the register maps ask for after DEVICE_RESET and SIGNAL_PATH_RESET
+_MASTER_MS = const(
+    5
+)  # in which the master ends what it began: 24 bytes, five addresses at the slowest clock
+
+# Bits of _doubt
+_DOUBT = const(1)  # a reset would explain what was seen: compare PWR_MGMT_1 out of turn
+_LOOKED = const(2)  # the last call did
+
+_FLAGS = const(10)  # of counts
+_FULL_SCALE_FLAGS = const(0x0C)
+_COUNT_MASK = const(0x3FFFFFFF)  # counters wrap within a small int of 32-bit ports
+_TRIES = const(3)  # repairs in a row that do not hold, before a full reset
+_PATIENCE_MS = const(250)  # and ten samples: without a sample for so long the chip is reset
+
+
+class Monitor:
+    """One register a call is compared with the table; a difference means that the chip has reset itself.
+
+    Then RESTORE writes the table back, VERIFY reads it back, and SETTLE lasts until the gyro has settled. Where
+    the registers are right but no samples come, or where a repair does not hold three times in a row, the chip
+    gets a full RESET first. The first row of the table is PWR_MGMT_1, the last USER_CTRL.
+
+    errors, resets (of the chip by itself) and full_resets (by this) are counters.
+    """
+
+    def __init__(self, registers, table, counts):
+        self.errors = 0
+        self.resets = 0
+        self.full_resets = 0
+        self.fifo_misaligned = (
+            0  # 1: the FIFO's packet boundary is not certain, it has to be restarted
+        )
+        self.device = None  # what is attached behind the chip; its health() has every second turn
+        self.who_am_i = None
+        self._read_into = registers.read_into
+        self._write = registers.write
+        self._table = table
+        self._counts = counts
+        self._byte = bytearray(1)
+        self.start(b"", 0, 0, 0)
+        # MicroPython looks for a method among the attributes of the instance first, and a table of attributes that
+        # is (nearly) full is searched from end to end, 1500 instructions for a call. So what every tick calls
+        # stands in that table.
+        self.health = self.health
+        self._compare = self._compare
+
+    def start(self, after_reset, interface, settle_samples, period_ms):
+        """Begin to watch a chip that has just been configured.
+
+        after_reset     pairs (register, value) that a full reset ends with
+        interface       the bits of USER_CTRL that the bus wants
+        settle_samples  samples to withhold after a repair
+        """
+        steps = [(register, 0) for register in _SLV_CTRL] + [(_WAIT, _MASTER_MS)]
+        self._without_master = 2 * len(steps)
+        steps += [(_USER_CTRL, interface), (_PWR_MGMT_1, _DEVICE_RESET), (_WAIT, _RESET_MS)]
+        if after_reset:
+            steps += list(after_reset)
+            steps.append((_WAIT, _RESET_MS))
+        self._reset_steps = bytes([byte for step in steps for byte in step])
+        self._interface = interface
+        self._settle_samples = settle_samples
+        self._patience_ms = _PATIENCE_MS + 10 * period_ms
+        self.state = WATCH
+        self._at = 0  # the row, or the step of the reset, that is next; -1 in RESTORE: the FIFO is switched off
+        self._left = 0  # samples still to be withheld
+        self._tries = 0
+        self._doubt = 0
+        self._silent = 0  # 1: no sample for longer than the patience
+        self._device_next = 0
+        self._stepped = 0  # when the last step of a full reset was written
+        self.heard()
+
+    def attach(self, device):
+        """Give every second turn to device.health(); None ends it."""
+        self.device = device
+        self._device_next = 0
+
+    def repair_calls(self):
+        """Calls of health() that a repair takes at most, if the bus works, from the first stale sample on."""
+        return 2 * len(self._table.numbers) + 3
+
+    # The tick: nothing below allocates, waits, raises or uses a float. A bytecode frame over 11 words comes from the
+    # heap, and a `try` takes three of them: hence so many small functions, and hardly a name beside a `try`.
+
+    @micropython.native
+    def health(self):
+        """Take the next step; returns a HEALTH_ state.
+
+        In WATCH a row of the table in turn; PWR_MGMT_1 out of turn (at most every second call) after a stale or
+        failed sample; every second turn goes to what is attached.
+        """
+        state = self.state
+        if state >= RESTORE:
+            return self._restore() if state == RESTORE else self._reset()
+        if state == VERIFY:
+            return self._take_row()
+        doubt = self._doubt
+        if doubt == _DOUBT:
+            return self._look()
+        self._doubt = doubt & _DOUBT
+        if self._device_next:
+            self._device_next = 0
+            self.device.health()
+            return HEALTH_OK
+        return self._take_row()
+
+    def _look(self):
+        """PWR_MGMT_1 out of turn."""
+        self._doubt = _LOOKED
+        found = self._compare(0)
+        if found == HEALTH_MISMATCH:
+            self._repair()
+        elif self._silent and found == HEALTH_OK:
+            return self._begin_reset()
+        return found
+
+    @micropython.native
+    def _take_row(self):
+        row = self._at
+        last = len(self._table.numbers) - 1
+        found = self._compare(row)
+        # while the FIFO waits for its restart, USER_CTRL may be anything
+        if found == HEALTH_MISMATCH and not (row == last and self.fifo_misaligned):
+            return self._repair()
+        if found == HEALTH_BUS_ERROR:
+            return found
+        self._at = row + 1 if row < last else 0
+        if self.state != VERIFY:
+            if self.device is not None:
+                self._device_next = 1
+            return HEALTH_OK
+        if row == last:
+            self._tries = 0
+            self.state = SETTLE if self._left else WATCH
+        return HEALTH_REPAIRING
+
+    @micropython.native
+    def _compare(self, row):
+        """Does a register still hold what the table says?"""
+        table = self._table
+        byte = self._byte
+        try:
+            self._read_into(table.numbers[row], byte)
+            if not (byte[0] ^ table.values[row]) & table.masks[row]:
+                return HEALTH_OK
+            # is it the chip that says so, or a floating bus?
+            self._read_into(_WHO_AM_I, byte)
+            if byte[0] == self.who_am_i:
+                return HEALTH_MISMATCH
+        except OSError:
+            pass
+        self.fault()
+        return HEALTH_BUS_ERROR
+
+    def _repair(self):
+        """The chip has reset itself."""
+        self.resets = (self.resets + 1) & _COUNT_MASK
+        if self._tries == _TRIES:
+            self._begin_reset()
+        else:
+            self._tries += 1
+            self.state = RESTORE
+            self._at = -1
+        self._left = 0
+        return HEALTH_MISMATCH
+
+    def _restore(self):
+        """Write one row back; before the first switch the FIFO off."""
+        row = self._at
+        try:
+            if row >= 0:
+                self._write(self._table.numbers[row], self._table.values[row])
+            else:
+                # a master that the reset has spared may be within a transaction
+                self._read_into(_USER_CTRL, self._byte)
+                self._write(_USER_CTRL, self._interface | self._byte[0] & _I2C_MST_EN)
+        except OSError:
+            self.fault()
+            return HEALTH_BUS_ERROR
+        row += 1
+        self._at = row
+        if row == len(self._table.numbers):
+            self._at = 0
+            self.state = VERIFY
+            self._left = self._settle_samples
+            if self._table.last() & _FIFO_ENABLE:
+                self.fifo_misaligned = 1
+            self.heard()
+        return HEALTH_REPAIRING
+
+    def _begin_reset(self):
+        self.full_resets = (self.full_resets + 1) & _COUNT_MASK
+        self.state = RESET
+        self._silent = self._tries = self._left = 0
+        # cut off within a transaction, the master would leave the device on its bus hanging
+        self._at = 0 if self._table.last() & _I2C_MST_EN else self._without_master
+        return HEALTH_REPAIRING
+
+    def _reset(self):
+        """One step of a full reset, which ends in RESTORE."""
+        at = self._at
+        steps = self._reset_steps
+        if steps[at] == _WAIT:
+            if time.ticks_diff(time.ticks_ms(), self._stepped) <= steps[at + 1]:
+                return HEALTH_REPAIRING
+        elif not self._step(at):
+            return HEALTH_BUS_ERROR
+        at += 2
+        self._at = at
+        if at == len(steps):
+            self.state = RESTORE
+            self._at = -1
+        return HEALTH_REPAIRING
+
+    def _step(self, at):
+        self._stepped = time.ticks_ms()
+        try:
+            self._write(self._reset_steps[at], self._reset_steps[at + 1])
+            return 1
+        except OSError:
+            self.fault()
+            return 0
+
+    # What read() and the FIFO have to tell
+
+    def fault(self):
+        """The bus has failed: counted, and health() is to look at the chip; returns the flags without "fresh"."""
+        self.errors = (self.errors + 1) & _COUNT_MASK
+        self._doubt |= _DOUBT
+        self.heard()
+        return self.not_fresh()
+
+    def doubt(self):
+        """Something was seen that a reset of the chip would explain: health() is to look."""
+        self._doubt |= _DOUBT
+
+    def no_sample(self, quiet):
+        """There is no new sample. quiet[0] is 0 where the last poll had one; returns the flags as fault() does."""
+        self._doubt |= _DOUBT
+        if not quiet[0]:
+            quiet[0] = 1
+            self.heard()
+        elif time.ticks_diff(time.ticks_ms(), self._since) > self._patience_ms:
+            # asleep on purpose?
+            self._silent = 0 if self._table.values[0] & _SLEEP else 1
+        return self.not_fresh()
+
+    def heard(self):
+        """The patience for the next sample begins anew."""
+        self._silent = 0
+        self._since = time.ticks_ms()
+
+    def withhold(self):
+        """A sample that came before the gyro had settled: counted down, and not fresh."""
+        self.heard()
+        if self._left:
+            self._left -= 1
+            if not self._left and self.state == SETTLE:
+                self.state = WATCH
+        return self.not_fresh()
+
+    def not_fresh(self):
+        """Clear the fresh bits of the flags in counts; returns the flags."""
+        counts = self._counts
+        flags = counts[_FLAGS] & _FULL_SCALE_FLAGS
+        counts[_FLAGS] = flags
+        return flags
