@@ -2,8 +2,12 @@
 PYTHON ?= python3
 VENV = .venv/bin
 PARALLEL ?= auto
+PYTEST = $(VENV)/python -m pytest -n $(PARALLEL) --dist loadgroup --no-loadscope-reorder
+CHECKED = cpython unix32
+space := $() $()
+comma := ,
 
-.PHONY: setup demo test lint bench clean
+.PHONY: setup demo check test lint bench clean
 
 setup:  ## .venv with .venv/bin/upright
 	@$(PYTHON) tools/bootstrap.py
@@ -11,10 +15,14 @@ setup:  ## .venv with .venv/bin/upright
 demo: setup  ## the firmware on the simulated board
 	@$(VENV)/upright demo
 
+check: setup lint  ## what a change most likely breaks, in two minutes: two runtimes, no emulated board
+	@$(VENV)/upright runtimes $(CHECKED)
+	@$(PYTEST) -q -m "not slow" --runtimes=$(subst $(space),$(comma),$(CHECKED)) $(PYTEST_ARGS)
+
 test: setup lint  ## everything, on every runtime that this machine can have
 	@$(PYTHON) tools/bootstrap.py --extras
-	@$(VENV)/upright runtimes
-	@$(VENV)/python -m pytest -n $(PARALLEL) --dist loadgroup $(PYTEST_ARGS)
+	@$(VENV)/upright runtimes cpython unix unix32 arm
+	@$(PYTEST) --build-board $(PYTEST_ARGS)
 
 lint: setup
 	@$(VENV)/ruff check .

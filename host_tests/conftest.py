@@ -1,6 +1,8 @@
 """What every test shares: the board's search path under CPython, a fresh simulated machine, and the runtimes."""
 
 import os
+import signal
+import subprocess
 import sys
 from collections import namedtuple
 from pathlib import Path
@@ -16,7 +18,7 @@ for folder in (
 
 import micropython  # noqa: E402, F401  (the shim: it prepares `time` before anything of lib/ is imported)
 import pytest  # noqa: E402
-from upright_host import oled, runtimes, simulate, trials  # noqa: E402
+from upright_host import oled, rp2040, runtimes, simulate, trials  # noqa: E402
 
 PORTABLE = Path(__file__).parent / "portable"
 
@@ -54,6 +56,11 @@ def pytest_addoption(parser):
     parser.addoption(
         "--runtimes", help="only these, as in cpython,unix32; tests of the others skip"
     )
+    parser.addoption(
+        "--build-board",
+        action="store_true",
+        help="build the emulated board's firmware, where there is none yet, beside the tests that do without it",
+    )
 
 
 def pytest_configure(config):
@@ -64,6 +71,32 @@ def pytest_configure(config):
             raise pytest.UsageError(f"--runtimes: unknown {', '.join(sorted(unknown))}")
         for name in set(runtimes.LISTED) - set(chosen.split(",")):
             runtimes.leave_out(name, "left out by --runtimes")
+    if not hasattr(config, "workerinput"):  # once, and the workers get the option as it is then
+        config.option.build_board = config.option.build_board and not rp2040.at_hand()
+        if config.option.build_board:
+            config.pluginmanager.register(BoardBuild())
+
+
+class BoardBuild:
+    """The emulated board's firmware in the making; the fixture `image` waits for it."""
+
+    def __init__(self):
+        command = [Path(sys.executable).with_name("upright"), "runtimes", "rp2040"]
+        self._process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+
+    def pytest_report_header(self):
+        return "the Pico's firmware is built meanwhile; its tests come last and wait for it"
+
+    def pytest_terminal_summary(self, terminalreporter):
+        if self._process.poll() is None:  # none of its tests was among these
+            self._process.send_signal(signal.SIGINT)
+        terminalreporter.section("the Pico's firmware")
+        said = self._process.communicate()[0].splitlines()[-4:] or [
+            "given up: nothing waits for it"
+        ]
+        terminalreporter.write("\n".join(said) + "\n")
 
 
 def pytest_generate_tests(metafunc):
@@ -82,9 +115,29 @@ def pytest_generate_tests(metafunc):
         metafunc.parametrize("recorded", params)
 
 
-def pytest_collection_modifyitems(items):
-    """The emulated board first: its tests share a board, so one worker has to run them, and that takes the longest."""
-    items.sort(key=lambda item: "test_rp2040" not in item.nodeid)
+def pytest_collection_modifyitems(config, items):
+    """The emulated board's first, since they take the longest; last while its firmware is still being built.
+
+    What runs whole recorded trials is slow.
+    """
+    last = config.option.build_board
+    items.sort(key=lambda item: ("test_rp2040" in item.nodeid) == last)
+    for item in items:
+        if "recorded" in item.fixturenames:
+            item.add_marker(pytest.mark.slow)
+
+
+@pytest.fixture(scope="session")
+def image():
+    """The emulated board's firmware; built first where it is not there yet, which takes minutes."""
+    require("rp2040")
+    return rp2040.image()
+
+
+@pytest.fixture(scope="session")
+def version(image):
+    """Of the MicroPython in `image`."""
+    return rp2040.version(image)
 
 
 @pytest.fixture(autouse=True)

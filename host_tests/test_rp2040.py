@@ -32,19 +32,6 @@ FLIGHT_S = 5.2
 CHECKPOINT_S = 0.3  # of motion, after which the second flight is held against the first
 
 
-@pytest.fixture(scope="module")
-def image():
-    try:
-        return firmware.image()
-    except runtimes.Unavailable as why:
-        pytest.skip(f"runtime rp2040: {why}")
-
-
-@pytest.fixture(scope="module")
-def version(image):
-    return firmware.version(image)
-
-
 # ---------------------------------------------------------------- the whole firmware
 class Flight:
     """The project's files on a board with sensor and display on one bus, and what was seen of them."""

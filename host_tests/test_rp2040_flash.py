@@ -17,9 +17,7 @@ from upright_host import (
     flash,
     packages,
     recordings,
-    runtimes,
 )
-from upright_host import rp2040 as firmware
 
 pytestmark = [pytest.mark.xdist_group("rp2040_flash"), pytest.mark.slow, pytest.mark.timeout(1800)]
 
@@ -46,14 +44,6 @@ class Snapshots:
         if not self.taken or now != self.taken[-1]:
             self.taken.append(now)
         self._board.at(self._board.now_us + SNAPSHOT_US, self._take)
-
-
-@pytest.fixture(scope="module")
-def image():
-    try:
-        return firmware.image()
-    except runtimes.Unavailable as why:
-        pytest.skip(f"runtime rp2040: {why}")
 
 
 @pytest.fixture(scope="module")

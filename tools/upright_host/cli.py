@@ -88,6 +88,7 @@ def exec_file(
 
 @app.command("runtimes")
 def list_runtimes(
+    names: list[str] = typer.Argument(None, help="Only these (default: all)."),
     image: Path = typer.Option(
         None, help="Take this RPI_PICO firmware (.uf2) for rp2040 instead of building one."
     ),
@@ -98,11 +99,17 @@ def list_runtimes(
             rp2040.take(image)
         except runtimes.Unavailable as why:
             raise console.Wrong(str(why)) from None
-    runtimes.obtain_all()
+    unknown = set(names or ()) - set(runtimes.LISTED)
+    if unknown:
+        raise console.Wrong(
+            f"unknown runtime {', '.join(sorted(unknown))}; there are {', '.join(runtimes.LISTED)}"
+        )
+    names = names or runtimes.LISTED
+    runtimes.obtain_all(names)
     table = Table(box=None, pad_edge=False)
     for column in ("runtime", "version", "what"):
         table.add_column(column)
-    for name in runtimes.LISTED:
+    for name in names:
         try:
             _, version = runtimes.interpreter(name)
             table.add_row(name, version, runtimes.what(name))

@@ -84,6 +84,11 @@ def image() -> Path:
         return built[-1] / "firmware.uf2" if built else _build()
 
 
+def at_hand() -> bool:
+    """Is there an image that need not be built?"""
+    return bool(os.environ.get(VARIABLE) or _cached())
+
+
 def version(path: Path) -> str:
     """-> the version of MicroPython in an image. Unavailable when it is no image for this board, or too old."""
     try:

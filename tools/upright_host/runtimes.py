@@ -209,12 +209,12 @@ def _find(name: str) -> tuple[list[str], str]:
         return command, _check(command)
 
 
-def obtain_all() -> None:
-    """Fetch in one go, with one progress bar, whatever of the runtimes is missing."""
-    wanted = [n for n in ("unix", "unix32", "arm") if not _folder(n).exists()]
+def obtain_all(names=NAMES) -> None:
+    """Fetch in one go, with one progress bar, whatever of these runtimes is missing."""
+    wanted = [n for n in ("unix", "unix32", "arm") if n in names and not _folder(n).exists()]
     if "unix" in wanted and shutil.which("micropython"):
         wanted.remove("unix")
-    if not shutil.which("qemu-arm") and not _folder("qemu").exists():
+    if "arm" in names and not shutil.which("qemu-arm") and not _folder("qemu").exists():
         wanted.append("qemu")
     if wanted:
         _obtain(wanted)
