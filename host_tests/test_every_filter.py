@@ -13,7 +13,7 @@ from conftest import healthy
 from test_inertial import FIELD_UT, errors, scene
 from test_rp2040 import as_trial
 from upright import filters
-from upright_host import replay, scoring, simulate
+from upright_host import registry, replay, scoring, simulate
 
 SOFTWARE = [name for name in filters.FILTERS if name not in filters.HARDWARE]
 AT_REST = array("h", [0, 0, 4096, 10, -20, 30, 66, 0, -150, 0, 3])
@@ -205,7 +205,7 @@ def hand(tmp_path_factory):
 @pytest.mark.parametrize("name", SOFTWARE)
 def test_the_firmware_runs_with_it_and_nothing_is_allocated(boot_board, hand, name):
     motion, path = hand
-    nine = "9" in name
+    nine = registry.axes(name) == 9
     boot = boot_board(
         world=str(path),
         seconds=4 if nine else 7,  # which takes 1 kHz
@@ -330,5 +330,5 @@ def test_a_start_in_the_middle_of_a_motion_is_forgotten(name, seed):
     late = 200 * 25
     print(f"{name} {seed}: {inclination[late:].max():.1f} {np.abs(heading[late:]).max():.1f}")
     assert inclination[late:].max() < 4
-    if "9" in name:
+    if registry.axes(name) == 9:
         assert np.abs(heading[late:]).max() < 10
