@@ -172,9 +172,8 @@ class AHRS:
             return
         running.remove(self)
         self._hold()
-        neighbours = [
-            other for other in running if _bus(other) is not None and _bus(other) is _bus(self)
-        ]
+        bus = _place(self)[0]
+        neighbours = [other for other in running if bus is not None and _place(other)[0] == bus]
         if neighbours:
             _run_together(neighbours)
 
@@ -186,11 +185,11 @@ class AHRS:
 
     def _neighbours(self):
         """Those that run on the same bus. One that has the same chip is stopped: it was left by a program."""
-        bus = _bus(self)
+        bus, chip = _place(self)
         found = []
         for other in list(running):
-            if bus is not None and _bus(other) is bus:
-                if other._driver.place[1] == self._driver.place[1]:
+            if bus is not None and _place(other)[0] == bus:
+                if _place(other)[1] == chip:
                     other.stop()
                 else:
                     found.append(other)
@@ -706,9 +705,13 @@ def _run_together(members):
         member.ticker = ticker
 
 
-def _bus(ahrs):
-    place = getattr(ahrs._driver, "place", None)
-    return place and place[0]
+def _place(ahrs):
+    """(bus, chip) of the sensor, as text: a port prints two objects of one bus alike, and two buses never.
+
+    None, None of a driver that does not say.
+    """
+    registers = getattr(ahrs._driver, "registers", None)
+    return [repr(part) for part in registers.place] if hasattr(registers, "place") else (None, None)
 
 
 def _nothing(*_):

@@ -73,6 +73,7 @@ class I2CRegisters(Registers):
     def __init__(self, i2c, address, error_class=OSError, name=plain_name):
         Registers.__init__(self, error_class, name)
         self.address = address
+        self.place = (i2c, address)  # what nothing else has: see ahrs.py
         self._out = bytearray(2)
         self.bind(i2c)
 
@@ -124,6 +125,7 @@ class SPIRegisters(Registers):
         self._head = bytearray(1)
         self._out = bytearray(2)
         self._cs = cs
+        self.place = (spi, cs)  # what nothing else has: see ahrs.py
         self.bind(spi)
 
     def bind(self, spi):

@@ -87,7 +87,8 @@ class SoftI2C:
         self._clock = _Clock(1000000000 // freq)
 
     def __repr__(self):
-        return "%s(freq=%d, timeout=%d)" % (type(self).__name__, self._freq, self._timeout)
+        name = type(self).__name__
+        return "%s(%d, freq=%d, timeout=%d)" % (name, id(self._bus), self._freq, self._timeout)
 
     def scan(self):
         found = []
@@ -206,6 +207,9 @@ class SoftSPI:
         self._clock = _Clock(0)
         self._hz = self._polarity = self._phase = 0
         self.init(baudrate, polarity=polarity, phase=phase)
+
+    def __repr__(self):
+        return "%s(%d, baudrate=%d)" % (type(self).__name__, id(self._bus), self._hz)
 
     def init(self, baudrate=None, *, polarity=None, phase=None, bits=8, firstbit=0):
         # allocates nothing, as on boards: a driver finds out by calling it with the heap locked

@@ -1,0 +1,528 @@
+"""The face: AHRS and start() on the simulated machine, what they give, what they refuse, and what they survive."""
+
+import importlib.util
+import math
+from array import array
+
+import kernel
+import machine
+import pytest
+import upright
+from chips.ist8310 import IST8310Chip
+from chips.mpu6050 import MPU6050Chip
+from chips.mpu6500 import MPU6500Chip
+from conftest import ROOT
+from upright import ahrs, calibration, timing
+from upright.auxiliary_bus import AuxiliaryBus
+from upright.ist8310 import IST8310
+from upright.mpu6050 import MPU6050
+from upright.mpu6500 import MPU6500
+from world import StillWorld
+
+G = 4096
+
+
+def gravity(roll, pitch):
+    """Counts of an accelerometer at rest, degrees."""
+    r, p = math.radians(roll), math.radians(pitch)
+    return tuple(
+        round(G * x) for x in (-math.sin(p), math.sin(r) * math.cos(p), math.cos(r) * math.cos(p))
+    )
+
+
+@pytest.fixture(autouse=True)
+def nothing_runs(tmp_path, monkeypatch):
+    """No AHRS of another test, and a folder of its own for the calibration file."""
+    monkeypatch.chdir(tmp_path)
+    ahrs.running.clear()
+    timing._taken.clear()
+    yield
+    ahrs.running.clear()
+
+
+def bus():
+    return machine.I2C(0, scl=machine.Pin(5), sda=machine.Pin(4), freq=400000)
+
+
+def chip(counts, address=0x68):
+    """A simulated MPU6050 at rest on bus 0 -> its world; .set(counts) moves it."""
+    world = StillWorld(counts)
+    world.start(0)
+    machine.wire_i2c(0, MPU6050Chip(world, address=address), 5, 4)
+    kernel.advance(200000)
+    return world
+
+
+def start(counts=(0, 0, G), **options):
+    world = chip(counts)
+    options = {"measure_bias": False, "log": None} | options
+    return upright.AHRS(MPU6050(bus()), **options).start(), world
+
+
+def run(seconds):
+    kernel.advance(round(seconds * 1000000))
+
+
+# ------------------------------------------------------------------------------- readings
+
+
+def test_before_the_first_step_the_angles_are_those_of_the_start():
+    imu, _ = start(gravity(20, -10))
+    assert imu.tick.steps == 0
+    assert imu.angles() == pytest.approx((20, -10, 0), abs=0.05)
+    out = array("i", [0] * 3)
+    imu.angles_into(out)
+    assert list(out) == pytest.approx([20000, -10000, 0], abs=50)
+
+
+@pytest.mark.parametrize("drive", ["timer", "fifo", "manual"])
+def test_a_body_at_rest_has_its_angles_and_no_motion_of_its_own(drive):
+    imu, _ = start(gravity(20, -10), drive=drive)
+    for _ in range(200):
+        run(0.005)
+        if drive == "manual":
+            imu.step()
+    assert imu.angles() == pytest.approx((20, -10, 0), abs=0.05)
+    assert imu.rates() == pytest.approx((0, 0, 0), abs=0.01)
+    assert imu.acceleration() == pytest.approx([x / G for x in gravity(20, -10)], abs=1e-3)
+    for frame in ("body", "earth"):
+        assert imu.linear_acceleration(frame) == pytest.approx((0, 0, 0), abs=2e-3)
+    assert imu.temperature() == pytest.approx(36.53, abs=0.1)
+    assert imu.heading() is None
+    assert 195 <= imu.status()["steps"] <= 201
+
+
+def test_linear_acceleration_turns_with_the_body():
+    """A push of 0.1 g along the body's x, after a quarter to the left: along the earth's y."""
+    imu, _ = start((410, 0, G))
+    q = math.sqrt(0.5)
+    imu.stop()
+    imu.filter.set_quaternion(q, 0, 0, q)
+    imu.tick.seeded()
+    assert imu.linear_acceleration() == pytest.approx((0.1, 0, 0), abs=1e-3)
+    assert imu.linear_acceleration("earth") == pytest.approx((0, 0.1, 0), abs=1e-3)
+    with pytest.raises(ValueError, match="frame is 'moon'"):
+        imu.linear_acceleration("moon")
+
+
+def test_the_order_of_the_angles_can_be_chosen_once_or_each_time():
+    imu, _ = start(gravity(20, -10), euler="zxy")
+    roll, pitch, yaw = imu.angles("zyx")
+    assert (roll, pitch, yaw) == pytest.approx((20, -10, 0), abs=0.05)
+    other = imu.angles()
+    assert other != pytest.approx((20, -10, 0), abs=1)
+    assert imu.angles("zxy") == other
+    out = array("i", [0] * 3)
+    imu.angles_into(out)
+    assert [x / 1000 for x in out] == pytest.approx(list(other), abs=1e-3)
+
+
+def test_turning_is_counted_past_half_a_turn_and_zeroed():
+    imu, _ = start((0, 0, G, 0, 0, round(16.4 * 50)))
+    run(20)
+    turned = 50 * 20
+    assert imu.rates() == pytest.approx((0, 0, 50), abs=0.05)
+    assert imu.turns() * 360 == pytest.approx(turned, abs=5)
+    assert imu.angles()[2] == pytest.approx((turned + 180) % 360 - 180, abs=5)
+    before = imu.quaternion()
+    imu.zero_yaw()
+    assert imu.angles()[2] == imu.turns() == 0
+    assert abs(imu.quaternion()[0]) == pytest.approx(1, abs=1e-4)
+    assert abs(before[0]) < 0.99
+    out = array("i", [0] * 3)
+    imu.angles_into(out)
+    assert out[2] == 0
+    run(10)
+    assert imu.turns() * 360 == pytest.approx(500, abs=3)
+    imu.angles_into(out)
+    assert out[2] == pytest.approx(500 % 360 * 1000, abs=3000)
+    rates = array("i", [0] * 3)
+    imu.rates_into(rates)
+    assert rates[2] == pytest.approx(50000, abs=50)
+
+
+def test_a_reading_is_of_one_step_however_late_it_is_asked():
+    imu, world = start(gravity(20, 0))
+    run(1)
+    reading = imu.reading()
+    said = [reading.angles(), reading.rates(), reading.acceleration(), reading.quaternion()]
+    world.set((*gravity(-60, 0), 500, 500, 500))
+    run(3)
+    later = [reading.angles(), reading.rates(), reading.acceleration(), reading.quaternion()]
+    assert later == said
+    assert imu.reading().step > reading.step
+
+
+def nine(**options):
+    """North is ahead; the field of central Europe."""
+    world = StillWorld((0, 0, G, 0, 0, 0, 82, 0, -141))
+    world.start(0)
+    imu = MPU6500Chip(world)
+    imu.aux.append(IST8310Chip(world))
+    machine.wire_spi(0, imu, cs=17)
+    kernel.advance(200000)
+    select = machine.Pin(17, machine.Pin.OUT, value=1)
+    sensor = MPU6500(machine.SPI(0, baudrate=1000000), select)
+    return upright.AHRS(
+        sensor, magnetometer=IST8310(AuxiliaryBus(sensor)), measure_bias=False, **options
+    )
+
+
+def test_the_heading_counts_clockwise_from_true_north():
+    with nine(declination=5, log=None) as imu:
+        run(1)
+        assert imu.filter.NAME == "inertial9"
+        assert imu.heading() == pytest.approx(5, abs=0.5)
+        imu.zero_yaw()
+        assert imu.heading() == pytest.approx(5, abs=0.5)
+        assert imu.status()["magnetometer_lost"] is False
+        assert imu.status()["field_accepted"] is not None
+
+
+# ------------------------------------------------------------------------------- level
+
+
+def test_a_tilted_mounting_is_trimmed_and_stays_so():
+    imu, world = start((*gravity(12, -7), 20, -10, 8))
+    run(10)
+    imu.level()
+    assert imu.angles() == pytest.approx((0, 0, imu.angles()[2]), abs=0.1)
+    run(2)
+    assert imu.angles()[:2] == pytest.approx((0, 0), abs=0.2)
+    assert imu.acceleration() == pytest.approx((0, 0, 1), abs=1e-3)
+    # a turn about the true vertical, as the tilted chip feels it
+    up = gravity(12, -7)
+    world.set(up + tuple(round(16.4 * 40 * u / G) for u in up))
+    run(2)
+    assert imu.rates() == pytest.approx((0, 0, 40), abs=1.5)
+    imu.stop()
+    world.set(up)
+    again = upright.AHRS(MPU6050(bus()), measure_bias=False, log=None).start()
+    assert again.angles()[:2] == pytest.approx((0, 0), abs=0.1)
+    assert calibration.read("upright_cal.json")["up_ppm"]
+    # once more, from there: the trim is of the mounting, not on top of the first
+    world.set(gravity(5, 3))
+    run(20)
+    again.level(save=False)
+    run(1)
+    assert again.angles()[:2] == pytest.approx((0, 0), abs=0.2)
+
+
+def test_a_body_that_turns_or_lies_on_its_side_has_no_level():
+    imu, world = start((0, 0, G, 0, 0, 300))
+    run(0.1)
+    with pytest.raises(ValueError, match="hold it still"):
+        imu.level()
+    imu.stop()
+    world.set(gravity(60, 0))
+    imu.start()
+    run(0.1)
+    with pytest.raises(ValueError, match="within 45 deg of z; turn IMU_AXES"):
+        imu.level()
+    before = imu.tick.steps
+    run(0.1)
+    assert imu.tick.steps > before  # it goes on as it was
+    assert imu.angles()[0] == pytest.approx(60, abs=0.5)
+
+
+# ------------------------------------------------------------------------------- start and stop
+
+
+def transfers(seconds):
+    before = machine.I2C(0)._bus.bytes
+    run(seconds)
+    return machine.I2C(0)._bus.bytes - before
+
+
+def test_with_gives_the_bus_back_after_an_exception_too():
+    chip((0, 0, G))
+    imu = upright.AHRS(MPU6050(bus()), measure_bias=False, log=None)
+    with pytest.raises(RuntimeError, match="mine"), imu:
+        assert transfers(0.1) > 0
+        raise RuntimeError("mine")
+    assert transfers(0.1) == 0
+    assert imu.angles() == pytest.approx((0, 0, 0), abs=0.01)  # the last attitude stays
+    assert not imu.status()["running"]
+
+
+def test_starting_again_stops_the_one_before_on_the_same_chip():
+    """As after a traceback, which leaves the tick running."""
+    first, _ = start()
+    second = upright.AHRS(MPU6050(bus()), measure_bias=False, log=None).start()
+    assert ahrs.running == [second]
+    steps = first.tick.steps
+    run(0.1)
+    assert first.tick.steps == steps
+    second.start()
+    assert ahrs.running == [second]
+    assert machine.I2C(0)._bus.cuts == 0
+
+
+def test_start_and_stop_of_the_package_are_those_of_board_py():
+    chip((0, 0, G))
+    imu = upright.start(rate=100, measure_bias=False, log=None)
+    assert imu.board == "simulated board"
+    again = upright.start(measure_bias=False, log=None, filter="mahony6")
+    assert ahrs.running == [again]
+    assert (again.filter.NAME, again.period_us) == ("mahony6", 5000)
+    upright.stop()
+    assert transfers(0.1) == 0
+
+
+def test_without_board_py_it_says_what_to_do(monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "board", None)
+    with pytest.raises(ImportError, match=r"upright.AHRS\(MPU6050\(i2c\)\)"):
+        upright.start()
+
+
+def test_what_a_board_py_lacks_is_not_taken_for_a_missing_board_py(monkeypatch, tmp_path):
+    import sys
+
+    (tmp_path / "board.py").write_text("import no_such_driver\n")
+    monkeypatch.delitem(sys.modules, "board", raising=False)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(ImportError, match="no_such_driver"):
+        upright.start()
+
+
+def test_before_start_there_is_nothing_to_read():
+    imu = upright.AHRS(MPU6050(bus()))
+    with pytest.raises(RuntimeError, match="start\\(\\) comes first"):
+        imu.angles()
+
+
+def test_a_sensor_that_is_absent_is_the_drivers_error_and_nothing_runs():
+    imu = upright.AHRS(MPU6050(bus()), log=None)
+    with pytest.raises(OSError, match="0x68"):
+        imu.start()
+    assert ahrs.running == []
+
+
+def test_a_step_can_be_waited_for():
+    imu, _ = start()
+    steps = imu.tick.steps
+    reading = imu.wait()
+    assert reading.step == steps + 1
+    imu.stop()
+    with pytest.raises(OSError, match="no step for 50 ms: it is stopped"):
+        imu.wait(50)
+
+
+def test_manual_steps_are_for_the_manual_drive():
+    imu, _ = start()
+    with pytest.raises(RuntimeError, match="manual"):
+        imu.step()
+
+
+def test_the_display_on_the_sensors_bus_is_written_by_the_tick_another_by_the_program():
+    from chips.ssd1306 import SSD1306Chip
+    from upright.ssd1306 import SSD1306
+
+    chip((0, 0, G))
+    shown = SSD1306Chip(), SSD1306Chip()
+    machine.wire_i2c(0, shown[0], 5, 4)
+    machine.wire_i2c(1, shown[1])
+    for shares, i2c in ((True, bus()), (False, machine.I2C(1))):
+        with upright.AHRS(
+            *(MPU6050(bus()),),
+            measure_bias=False,
+            log=None,
+            display=lambda chunk, i2c=i2c: SSD1306(i2c, chunk=chunk),
+            display_shares_bus=shares,
+        ) as imu:
+            imu.display.fill(1)
+            imu.display.show()
+            run(0.5)
+            assert imu.display.busy is not shares
+            while imu.refresh_display():
+                pass
+        assert all(shown[0 if shares else 1].ram)
+    assert machine.I2C(0)._bus.cuts == 0
+
+
+# ------------------------------------------------------------------------------- one bus, one tick
+
+
+def two(**options):
+    worlds = chip(gravity(20, 0)), chip(gravity(-30, 0), 0x69)
+    i2c = bus()
+    both = []
+    for address in (0x68, 0x69):
+        imu = upright.AHRS(MPU6050(i2c, address), measure_bias=False, log=None, **options)
+        both.append(imu.start())
+    return both, worlds
+
+
+@pytest.mark.parametrize("drive", ["timer", "fifo"])
+def test_two_sensors_on_one_bus_share_one_tick(drive):
+    (left, right), _ = two(drive=drive)
+    run(1)
+    assert left.ticker is right.ticker
+    assert left.angles()[0] == pytest.approx(20, abs=0.1)
+    assert right.angles()[0] == pytest.approx(-30, abs=0.1)
+    assert machine.I2C(0)._bus.cuts == 0
+    for imu in (left, right):
+        status = imu.status()
+        assert (status["missed"], status["errors"], status["crashes"]) == (0, 0, 0)
+        assert status["steps"] >= 195
+    left.stop()
+    stopped, goes_on = left.tick.steps, right.tick.steps
+    run(0.5)
+    assert left.tick.steps == stopped
+    assert right.tick.steps == pytest.approx(goes_on + 100, abs=12)
+    assert right.status()["missed"] == 0
+
+
+def test_two_sensors_on_one_bus_have_one_rate():
+    imu, _ = start()
+    chip((0, 0, G), 0x69)
+    other = upright.AHRS(MPU6050(bus(), 0x69), rate=100, log=None)
+    with pytest.raises(ValueError, match="share one tick"):
+        other.start()
+    before = imu.tick.steps
+    run(0.1)
+    assert imu.tick.steps > before
+
+
+def test_the_first_goes_on_when_the_second_cannot_be_started():
+    imu, _ = start()
+    other = upright.AHRS(MPU6050(bus(), 0x69), log=None)
+    with pytest.raises(OSError, match="0x69"):
+        other.start()
+    before = imu.tick.steps
+    run(0.1)
+    assert imu.tick.steps == pytest.approx(before + 20, abs=2)
+    assert ahrs.running == [imu]
+
+
+def test_two_sensors_on_two_buses_have_a_tick_each():
+    left, _ = start(rate=200)
+    world = StillWorld(gravity(40, 0))
+    world.start(0)
+    machine.wire_i2c(1, MPU6050Chip(world))
+    kernel.advance(200000)
+    right = upright.AHRS(
+        MPU6050(machine.I2C(1, freq=400000)), rate=100, measure_bias=False, log=None
+    ).start()
+    run(1)
+    assert left.ticker is not right.ticker
+    assert right.angles()[0] == pytest.approx(40, abs=0.1)
+    assert left.tick.steps > right.tick.steps
+
+
+# ------------------------------------------------------------------------------- control loops and Ctrl-C
+
+
+def test_on_step_sees_the_angles_and_the_rates_of_its_step():
+    seen = []
+    angles, rates = array("i", [0] * 3), array("i", [0] * 3)
+    words = array("i", [0] * 15)
+
+    def control(imu):
+        imu.angles_into(angles)
+        imu.rates_into(rates)
+        imu.snapshot(words)
+        seen.append((words[5], angles[1], rates[2]))
+
+    _, _ = start((*gravity(0, 8), 0, 0, 164), on_step=control)
+    run(0.5)
+    assert [step for step, _, _ in seen] == list(range(1, len(seen) + 1))
+    assert len(seen) >= 98
+    assert all(angle == pytest.approx(8000, abs=100) for _, angle, _ in seen)
+    assert all(rate == pytest.approx(10000, abs=100) for _, _, rate in seen)
+
+
+def test_an_on_step_that_raises_is_counted_and_told():
+    def control(imu):
+        raise ZeroDivisionError("gain")
+
+    imu, _ = start(on_step=control)
+    run(0.1)
+    status = imu.status()
+    assert status["step_errors"] == status["steps"] > 15
+    assert isinstance(status["step_error"], ZeroDivisionError)
+    assert status["faults"] == status["step_errors"]
+
+
+def test_a_ctrl_c_that_lands_in_the_tick_comes_with_the_next_call_and_the_tick_goes_on():
+    hits = [3]
+
+    def control(imu):
+        hits[0] -= 1
+        if not hits[0]:
+            raise KeyboardInterrupt
+
+    imu, _ = start(on_step=control)
+    run(0.1)
+    with pytest.raises(KeyboardInterrupt):
+        imu.angles()
+    before = imu.tick.steps
+    run(0.1)
+    assert imu.tick.steps > before
+    imu.angles()
+    assert imu.status()["crashes"] == 0
+
+
+# ------------------------------------------------------------------------------- settings
+
+
+def test_every_wrong_setting_is_named_at_once_and_before_anything_moves():
+    chip((0, 0, G))
+    imu = upright.AHRS(
+        *(MPU6050(bus()), 0),
+        filter="magic",
+        drive="telepathy",
+        euler="xyz",
+        accel_range_g=3,
+        dlpf=2,
+        display_chunk=7,
+        log=None,
+    )
+    with pytest.raises(ValueError) as why:
+        imu.start()
+    for name in ("RATE is 0", "DRIVE is", "EULER is", "ACCEL_RANGE_G is 3", "DISPLAY_CHUNK is 7"):
+        assert name in str(why.value)
+    assert transfers(0) == 0 == machine.I2C(0)._bus.bytes
+
+
+def test_an_option_that_is_none_is_refused():
+    with pytest.raises(ValueError, match="no setting RATEE"):
+        upright.AHRS(MPU6050(bus()), ratee=100)
+
+
+def test_where_timers_are_soft_the_fifo_is_drained(monkeypatch):
+    monkeypatch.setattr(timing.sys, "platform", "esp32")
+    imu, _ = start(gravity(20, 0))
+    assert imu.drive == "fifo"
+    assert not imu.ticker.hard
+    for _ in range(10):
+        kernel.sleep_us(100000)
+    assert imu.status()["steps"] == pytest.approx(200, abs=10)
+    assert imu.status()["fresh"] == imu.status()["steps"]
+    assert imu.angles()[0] == pytest.approx(20, abs=0.1)
+
+
+def test_a_timer_that_cannot_keep_the_rate_is_refused_before_the_bus_is_touched():
+    chip((0, 0, G))
+    imu = upright.AHRS(MPU6050(bus()), rate=700, log=None)
+    with pytest.raises(ValueError, match="cannot tick at 700/1 Hz"):
+        imu.start()
+    assert machine.I2C(0)._bus.bytes == 0
+
+
+def test_a_data_ready_drive_wants_its_pin():
+    imu = upright.AHRS(MPU6050(bus()), drive="data_ready")
+    with pytest.raises(ValueError, match="pin that INT is on"):
+        imu.start()
+
+
+@pytest.mark.parametrize("folder", sorted(p.parent.name for p in ROOT.glob("boards/*/board.py")))
+def test_the_settings_of_every_board_can_be_had(folder):
+    spec = importlib.util.spec_from_file_location("a_board", ROOT / "boards" / folder / "board.py")
+    board = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(board)
+    imu = ahrs.from_board(board)
+    imu.settings.check(6 if not hasattr(board, "magnetometer") else 9)
+    assert imu.board == board.NAME
