@@ -1,4 +1,5 @@
-# Freezes Upright's library into a MicroPython firmware: FROZEN_MANIFEST=.../manifest.py, or include() this file in a
-# board's own manifest. freeze() takes what lies in lib/, so that a new module needs no line here.
+# Freezes Upright, library and application, into a MicroPython firmware: FROZEN_MANIFEST=.../manifest.py, or include()
+# this file in a board's own manifest. What is frozen takes no room in the file system and comes before what lies there.
 
-freeze("lib")  # noqa: F821  a name that MicroPython's build gives to manifests
+package("upright", base_path="lib", opt=2)  # noqa: F821  names that MicroPython's build gives to manifests
+package("upright_app", base_path="firmware", opt=2)  # noqa: F821

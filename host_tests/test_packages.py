@@ -10,7 +10,7 @@ import threading
 import pytest
 from conftest import some_micropython
 from unix_board import UnixBoard
-from upright_host import __version__, packages, paths, runtimes
+from upright_host import __version__, library, packages, paths, runtimes
 
 
 def test_the_package_files_are_as_they_would_be_written():
@@ -30,6 +30,7 @@ def test_every_module_is_in_a_package_and_every_version_is_the_projects():
         for _, url in package["urls"]:
             assert (path.parent / url).exists()
     assert named == {path.name for path in paths.PACKAGE.glob("*.py")}
+    assert library.upright("__init__").__version__ == __version__
     whole = [json.loads((p / "package.json").read_text()) for p in (paths.ROOT, paths.PACKAGE)]
     for package in whole:
         assert {at for at, _ in package["urls"]} == {f"upright/{name}" for name in named}

@@ -52,6 +52,28 @@ class Os:
 sys.modules["os"] = Os()
 """
 
+# The file system of a board in RAM, in place of the folder
+_DISK = """
+class Disk:
+    def __init__(self, block, blocks):
+        self.block, self.blocks, self.data = block, blocks, bytearray(block * blocks)
+    def readblocks(self, n, buffer, offset=0):
+        at = n * self.block + offset
+        buffer[:] = self.data[at : at + len(buffer)]
+    def writeblocks(self, n, buffer, offset=0):
+        at = n * self.block + offset
+        self.data[at : at + len(buffer)] = buffer
+    def ioctl(self, op, argument):
+        return {4: self.blocks, 5: self.block}.get(op, 0)
+kind, block, blocks = %r
+disk = Disk(block, blocks)
+kind = getattr(_os, kind)
+kind.mkfs(disk)
+_os.mount(kind(disk), "/flash")
+_os.chdir("/flash")
+sys.path[:] = ["", ".frozen", "/flash/lib"]
+"""
+
 # Runs a line of JSON (the code) in one namespace; the answer: a line of JSON [output, error or null]
 _SERVER = """
 import builtins, json, io
@@ -99,12 +121,16 @@ class PowerCut(Exception):
 
 class UnixBoard(Transport):
     """folder: its file system. left: how many steps it still carries out; None: all. free: bytes of its file system,
-    in blocks of 512; None: many."""
+    in blocks of 512; None: many. disk: the file system ("VfsFat", bytes of a block, blocks), empty, in its place."""
 
-    def __init__(self, folder, left=None, free=None):
+    def __init__(self, folder, left=None, free=None, disk=None):
         start, _ = runtimes.interpreter(simulate.best_runtime())
         self._process = subprocess.Popen(
-            [*start, "-c", _OS % (left, free) + _SERVER],
+            [
+                *start,
+                "-c",
+                _OS % (left, free) + (_DISK.replace("%r", repr(disk)) if disk else "") + _SERVER,
+            ],
             cwd=folder,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

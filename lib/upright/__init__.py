@@ -6,6 +6,8 @@
 #
 # Each function imports what it needs when it is called: a program that wants one module alone pays for that alone.
 
+__version__ = "0.1.0"
+
 
 def start(**settings):
     """Start with the sensors and settings of board.py -> AHRS (upright/ahrs.py). A start before this one is stopped.

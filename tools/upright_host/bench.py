@@ -17,7 +17,7 @@ from pathlib import Path
 import typer
 from rich.table import Table
 
-from upright_host import console, emulated, options, paths, rp2040, runtimes, tracing
+from upright_host import console, contents, emulated, options, paths, rp2040, runtimes, tracing
 from upright_host.console import Failed, Wrong
 
 PROGRAMS = paths.SIMULATOR / "bench"
@@ -317,6 +317,12 @@ def register(app: typer.Typer) -> None:
             _show(BOARD_TITLE, board_rows(figures))
         for remark in remarks(figures):
             console.say(remark)
+        table = Table(title="installed on a board, bytes", title_justify="left", box=None)
+        for column in ("board", "files", "bytes", "packed"):
+            table.add_column(column, justify="left" if column == "board" else "right")
+        for board, *numbers in contents.sizes():
+            table.add_row(board, *(f"{number:,}" for number in numbers))
+        console.out.print(table)
         if save_to:
             save(figures, save_to)
         of = figures.instructions

@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import tempfile
+import zlib
 from pathlib import Path
 
 from upright_host import device, packages, paths, registry, runtimes
@@ -11,6 +12,15 @@ from upright_host import device, packages, paths, registry, runtimes
 ON_DEMAND = ("axis_check", "doctor", "record")
 # Of the library, imported only by what is called by hand: the self-test.
 BY_HAND = ("mpu_selftest",)
+# The boards of boards/ and their processors' native code, as mpy-cross calls it
+ARCHITECTURES = {
+    "esp32": "xtensawin",
+    "pico": "armv6m",
+    "pico2": "armv7emsp",
+    "pyboard": "armv7emsp",
+    "robomaster_a": "armv7emsp",
+    "weact_f411_blackpill": "armv7emsp",
+}
 # Older installations had these in the board's root and in /lib: {name there: module now}
 MOVED = {
     **{name: f"upright.{name}" for name in (
@@ -53,6 +63,40 @@ def board_files(
         else:
             files[f"{name}.py"] = path.read_bytes()
     return files
+
+
+def packed(files: dict[str, bytes]) -> dict[str, bytes]:
+    """The same installation for a file system that is too small for it: modules compressed to about half, which
+    upright_app/packed.py unpacks as they are imported."""
+    made = {}
+    for name, content in files.items():
+        stem, _, form = name.rpartition(".")
+        if form != "mpy":
+            made[name] = content
+        elif stem == "lib/upright_app/__init__":
+            made[f"{stem}.py"] = b'import upright\n\n__path__ = "/upright_z/upright_app"\n'
+        else:
+            packer = zlib.compressobj(
+                9, zlib.DEFLATED, 12
+            )  # takes 4 kB of the board while it unpacks
+            made[f"{stem.replace('__init__', 'init')}.z"] = (
+                packer.compress(content) + packer.flush()
+            )
+    made["lib/upright/__init__.py"] = (paths.APPLICATION / "packed.py").read_bytes()
+    return made
+
+
+def sizes() -> list[tuple[str, int, int, int]]:
+    """(board, files, bytes, bytes packed) of what `upright flash` installs on each board by default."""
+    rows = []
+    for board, architecture in ARCHITECTURES.items():
+        facts = device.Facts("", "", (1, 27, 0), 6, 3, architecture, True, True, True, True, 0)
+        files = board_files(board, facts)
+        small = packed(files)
+        rows.append(
+            (board, len(files), sum(map(len, files.values())), sum(map(len, small.values())))
+        )
+    return rows
 
 
 def library(text: str) -> set[str]:
@@ -127,7 +171,7 @@ def find_compiler(facts: device.Facts) -> Path:
 
 
 def compile_module(compiler: Path, architecture: str, path: Path) -> bytes:
-    """-> the .mpy of a module: with line numbers, which cost 4 % and make a traceback worth having."""
+    """-> the .mpy of a module: with line numbers, which cost 3 % and make a traceback worth having."""
     return _compile(compiler, architecture, path.read_text(), path.name)
 
 

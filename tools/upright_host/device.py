@@ -38,7 +38,8 @@ _m = getattr(sys.implementation, '_mpy', 0)
 _s = os.statvfs(os.getcwd())
 print(repr((sys.platform, getattr(sys.implementation, '_machine', ''), tuple(sys.implementation.version[:3]), _m,
  _has('@micropython.viper\\ndef f():\\n pass'), _has('import pyb\\npyb.Timer'), _has('import machine\\nmachine.Timer'),
- _has('import framebuf'), _s[0] * _s[3], _frozen())))
+ _has('import framebuf'), _s[0] * _s[3],
+ _has('import deflate'), _frozen())))
 """
 
 
@@ -61,6 +62,7 @@ class Facts:
     machine_timer: bool
     framebuf: bool
     free_bytes: int
+    deflate: bool = False
     frozen: str = ""  # the version of Upright that is in the firmware, "" when there is none
 
     def problems(self) -> list[str]:
@@ -142,12 +144,12 @@ def opened(port: str | None, emulated: bool = False):
 def facts(transport) -> Facts:
     """Ask a board what it is."""
     answer = ast.literal_eval(transport.exec(_QUESTIONS).decode().strip().splitlines()[-1])
-    platform, machine, version, mpy, viper, pyb, timer, framebuf, free, frozen = answer
+    platform, machine, version, mpy, viper, pyb, timer, framebuf, free, deflate, frozen = answer
     index = mpy >> 10 & 15
     architecture = _ARCHITECTURES[index] if index < len(_ARCHITECTURES) else f"number {index}"
     return Facts(
         platform, machine, version, mpy & 0xFF, mpy >> 8 & 3, architecture, viper, pyb, timer,
-        framebuf, free, frozen,
+        framebuf, free, deflate, frozen,
     )  # fmt: skip
 
 

@@ -113,7 +113,7 @@ def plan(transport, files: dict[str, bytes], force: bool = False) -> Plan:
     cut off: that is finished first."""
     ours = _finish(transport)
     recorded = _read_record(transport).get("files", {})
-    others = {name: _other_form(name) for name in files if name not in KEPT}
+    others = {n: _other_form(n) for n in files if n not in KEPT and n.endswith(("py", "mpy"))}
     root = [f.name for f in transport.fs_listdir("") if not f.st_mode & 0x4000]
     programs = [name for name in root if name.endswith(".py") and name not in SHADOWS]
     names = [*files, *others.values(), *recorded, *SHADOWS, *programs]
@@ -236,6 +236,43 @@ def _finish(transport) -> set[str]:
 # ------------------------------------------------------------------------------------------ carrying it out
 
 
+class Work:
+    """What a plan takes of a board.
+
+    files     {name: content} of all that is sent; order: their names; remove: names
+    stand_in  whether a boot.py stands in for main.py meanwhile
+    beside    whether there is room for the new files beside the old ones; shortage: why there is none at all, or None
+    """
+
+    def __init__(self, transport, plan: Plan):
+        transport.exec(_CLEAR.format(stage=STAGE))
+        self.files = files = plan.install | {RECORD: json.dumps(plan.record).encode()}
+        self.remove = remove = list(plan.remove)
+        # main.py first, then whatever boots is new. Where the file system cannot replace it in one step it is missing
+        # for a moment: a boot.py stands in, unless the user has one.
+        self.order = sorted(files, key=lambda name: (name != "main.py", name == RECORD))
+        is_replaced = "main.py" in files and plan.found["main.py"][0]
+        self.stand_in = is_replaced and (plan.found["boot.py"][0] is None or "boot.py" in remove)
+        if self.stand_in and "boot.py" not in remove:
+            remove.append("boot.py")
+        block, free = device.space(transport)
+
+        def room(sizes):
+            return sum(-(-size // block) * block for size in sizes)
+
+        sizes = [*map(len, files.values()), *(plan.found[name][1] for name in plan.backup)]
+        need = room([*sizes, len(_in_front(f"finish({self.order!r}, {remove!r})"))])
+        need += _room_of_folders(plan, files, block)
+        freed = room(plan.found.get(name, (None, 0))[1] for name in {*files, *remove, SELF})
+        self.beside = need + SPARE <= free
+        self.shortage = None
+        if need + SPARE > free + freed:
+            self.shortage = (
+                f"{need} bytes and {SPARE} to spare do not fit: {free} are free on the board and {freed} "
+                "would become so"
+            )
+
+
 def execute(transport, plan: Plan, on_progress=None) -> bool:
     """Carry a plan out -> False where old and new had no room together. on_progress(name, bytes done, bytes in all).
 
@@ -247,38 +284,19 @@ def execute(transport, plan: Plan, on_progress=None) -> bool:
             f"nothing was changed. In the way:\n{listed}\n"
             "Rename or remove it, or let --force do so (it keeps a copy, NAME.bak)"
         )
-    transport.exec(_CLEAR.format(stage=STAGE))
-    files = plan.install | {RECORD: json.dumps(plan.record).encode()}
-    remove = list(plan.remove)
-    # main.py first, then whatever boots is new. Where the file system cannot replace it in one step it is missing for a
-    # moment: a boot.py stands in, unless the user has one.
-    order = sorted(files, key=lambda name: (name != "main.py", name == RECORD))
-    is_replaced = "main.py" in files and plan.found["main.py"][0]
-    stand_in = is_replaced and (plan.found["boot.py"][0] is None or "boot.py" in remove)
-    if stand_in and "boot.py" not in remove:
-        remove.append("boot.py")
-    block, free = device.space(transport)
-
-    def room(sizes):
-        return sum(-(-size // block) * block for size in sizes)
-
-    sizes = [*map(len, files.values()), *(plan.found[name][1] for name in plan.backup)]
-    need = room([*sizes, len(_in_front(f"finish({order!r}, {remove!r})"))])
-    need += _room_of_folders(plan, files, block)
-    freed = room(plan.found.get(name, (None, 0))[1] for name in {*files, *remove, SELF})
-    if need + SPARE > free + freed:
+    work = Work(transport, plan)
+    if work.shortage:
         raise device.DeviceError(
-            f"{need} bytes and {SPARE} to spare do not fit: {free} are free on the board and {freed} would "
-            "become so. Nothing was changed. Remove files of your own, or freeze Upright into the firmware "
+            f"{work.shortage}. Nothing was changed. Remove files of your own, or freeze Upright into the firmware "
             "(README.md of the board)"
         )
-    staged = need + SPARE <= free
+    files, order, remove, staged = work.files, work.order, work.remove, work.beside
     _make_folders(transport, [*files, f"{STAGE}/{SELF}"])
     _back_up(transport, plan)
     if staged:
         sent = {f"{STAGE}/{i}": files[name] for i, name in enumerate(order)}
         _send(transport, sent, dict(zip(sent, order, strict=True)), on_progress)
-        if stand_in:
+        if work.stand_in:
             _send(transport, {f"{STAGE}/boot.py": BOOT}, {}, None)
             transport.exec(f"import os\nos.rename('{STAGE}/boot.py', 'boot.py')")
         _put_in_front(transport, f"finish({order!r}, {remove!r})")
@@ -408,6 +426,9 @@ def run(transport, board: str, source: bool, force: bool, everything: bool = Fal
         say(f"Upright {found.frozen} is frozen into this firmware, and is what will run")
     files = contents.board_files(board, found, source, _own(transport), everything)
     steps = plan(transport, files, force)
+    if found.deflate and not source and Work(transport, steps).shortage:
+        say("packed, as there is no room for the modules as they are")
+        steps = plan(transport, contents.packed(files), force)
     for name, why in steps.kept:
         can = " (--force replaces it, and keeps a copy as NAME.bak)" if name in KEPT else ""
         say(f"{name}: {why}: kept as it is{can}")

@@ -57,11 +57,11 @@ def board_path(board: str = "sim", simulated: bool = True) -> list[Path]:
 def board_modules() -> dict[str, Path]:
     """Every module that an installation may hold: {name on a board, without suffix: source}.
 
-    Without the application's installation.py, which is on a board only while something is installed.
+    Without two of the application that flash.py puts onto a board in its own way.
     """
     return {
         f"lib/{path.parent.name}/{path.stem}": path
         for room in (PACKAGE, APPLICATION)
         for path in sorted(room.glob("*.py"))
-        if path.stem != "installation"
+        if path.stem not in ("installation", "packed")
     }

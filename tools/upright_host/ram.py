@@ -98,10 +98,8 @@ def load(transport, facts: device.Facts, *names: str):
 
 def _missing(transport, needed: set[str]) -> list[str]:
     """Those of these modules of lib/upright that are not on the board, each behind those that it imports."""
-    places = [f"lib/upright/{name}.{form}" for name in needed for form in ("mpy", "py")]
-    found = flash.look(transport, places)
-    missing = {
-        n for n in needed if not any(found[f"lib/upright/{n}.{f}"][0] for f in ("mpy", "py"))
-    }
+    forms = ("mpy", "py", "z")
+    found = flash.look(transport, [f"lib/upright/{n}.{f}" for n in needed for f in forms])
+    missing = {n for n in needed if not any(found[f"lib/upright/{n}.{f}"][0] for f in forms)}
     first = {name: contents.with_imports({name}, late=False) & missing for name in missing}
     return sorted(missing, key=lambda name: (len(first[name]), name))

@@ -1,0 +1,44 @@
+# Stands for lib/upright/__init__ where the file system has no room for the modules as they are: it unpacks each as it
+# is imported. The modules lie beside it as NAME.z, compressed .mpy files; the package's own __init__ is init.z.
+# `upright flash` installs it where it has to. Needs deflate; every port that has that.
+
+import os
+
+import deflate
+
+_FOLDER = __file__[: __file__.rfind("/")]  # .../upright
+_PLACE = "/upright_z"
+
+
+class _Packed:
+    """A file system of the modules: /upright/NAME.mpy and /upright_app/NAME.mpy, read only."""
+
+    def mount(self, readonly, mkfs):
+        pass
+
+    def umount(self):
+        pass
+
+    def stat(self, path):
+        return os.stat(_packed(path))
+
+    def open(self, path, mode):
+        return deflate.DeflateIO(open(_packed(path), "rb"), deflate.ZLIB)
+
+
+def _packed(path):
+    path = path.strip("/")
+    if path.endswith(".mpy"):
+        path = path[:-3] + "z"
+    elif path.endswith(".py"):
+        raise OSError(2)
+    return "%s/%s" % (_FOLDER[: _FOLDER.rfind("/")], path)
+
+
+try:
+    os.mount(_Packed(), _PLACE)
+except OSError:
+    pass  # it is there already
+__path__ = _PLACE + "/upright"
+from upright.init import *  # noqa: E402, F403
+from upright.init import __version__  # noqa: E402, F401
