@@ -118,12 +118,9 @@ def test_an_older_board_is_moved_over_and_keeps_what_is_its_users(flashed, keep,
 
 def test_the_flashed_board_gives_angles_beside_a_tutorials_modules(image, flashed, keep):
     board = transport.EmulatedTransport(transport.pico(image, keep.read_bytes()))
-    board.exec(
-        "import board, time\nfrom upright_app import app\na = app.App(board)\na.start()\n"
-        "t = time.ticks_ms()\nwhile time.ticks_diff(time.ticks_ms(), t) < 300:\n    a.poll()"
-    )
-    assert board.eval("a.tick.steps") > 40
-    assert [abs(angle) < 1000 for angle in board.eval("list(a.angles)")] == [True] * 3
+    board.exec("import time, upright\nimu = upright.start()\ntime.sleep_ms(300)")
+    assert board.eval("imu.status().steps") > 40
+    assert [abs(angle) < 1 for angle in board.eval("tuple(imu.angles())")] == [True] * 3
 
 
 def test_whenever_the_power_fails_the_board_boots_the_old_or_the_new_whole(

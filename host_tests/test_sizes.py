@@ -90,7 +90,7 @@ def test_the_pyboards_file_system_is_the_one_that_its_readme_names(fresh):
 
 def test_a_packed_installation_is_imported_as_any_other(tmp_path):
     some_micropython()
-    board = UnixBoard(tmp_path, disk=DISKS["pyboard"])
+    board = UnixBoard(tmp_path, disk=DISKS["robomaster_a"])
     try:
         facts = device.facts(board)
         assert facts.deflate

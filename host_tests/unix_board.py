@@ -128,6 +128,7 @@ class UnixBoard(Transport):
         self._process = subprocess.Popen(
             [
                 *start,
+                *("-X", "heapsize=8M"),
                 "-c",
                 _OS % (left, free) + (_DISK.replace("%r", repr(disk)) if disk else "") + _SERVER,
             ],

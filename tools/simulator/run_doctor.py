@@ -11,6 +11,13 @@ from world import LEVEL, StillWorld
 import boards
 
 
+class Port:
+    """The port that a board is for, as timing.py asks sys for it."""
+
+    def __init__(self, platform):
+        self.platform = platform
+
+
 def main():
     with open(sys.argv[1]) as file:
         config = json.load(file)
@@ -23,8 +30,10 @@ def main():
 
     boards.wire(config.get("board_name", "sim"), board, world, config)
 
+    from upright import timing
     from upright_app import doctor
 
+    timing.sys = Port(getattr(board, "PLATFORM", sys.platform))
     problems = doctor.report(board)
     print("\tresult", json.dumps({"problems": problems}))
 

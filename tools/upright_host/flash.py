@@ -74,6 +74,12 @@ with open({a!r}, 'rb') as _f:
                 break
             _g.write(_d)
 """
+# Closed before it runs: it removes itself
+FINISH = f"""
+with open({SELF!r}) as _f:
+    _text = _f.read()
+exec(_text, {{"__name__": "finish"}})
+"""
 # Files of the stage that was left by an installation that never came to hold
 _CLEAR = """
 import os
@@ -228,7 +234,7 @@ def _finish(transport) -> set[str]:
         return set()
     if not text.startswith(MARK):
         return set()
-    transport.exec(f"exec(open({SELF!r}).read(), {{'__name__': 'finish'}})")
+    transport.exec(FINISH)
     call = ast.parse(text).body[-1].value
     return set(ast.literal_eval(call.args[0])) | {SELF} if call.func.id == "refuse" else set()
 
@@ -300,7 +306,7 @@ def execute(transport, plan: Plan, on_progress=None) -> bool:
             _send(transport, {f"{STAGE}/boot.py": BOOT}, {}, None)
             transport.exec(f"import os\nos.rename('{STAGE}/boot.py', 'boot.py')")
         _put_in_front(transport, f"finish({order!r}, {remove!r})")
-        transport.exec(f"exec(open({SELF!r}).read(), {{'__name__': 'finish'}})")
+        transport.exec(FINISH)
     else:
         _put_in_front(transport, f"refuse({sorted({*order, *remove})!r})")
         for name in [*(n for n in order if n != RECORD), *remove]:
