@@ -7,8 +7,6 @@ from chips.mpu6050 import MPU6050Chip
 from chips.mpu6500 import MPU6500Chip
 from upright.auxiliary_bus import (
     AUX_BUSY,
-    AUX_DONE,
-    AUX_IDLE,
     AUX_NACK,
     AUX_TIMEOUT,
     AuxiliaryBus,
@@ -22,7 +20,7 @@ from world import StillWorld
 
 USER_CTRL, MST_CTRL, DELAY_CTRL, SLV4_CTRL, SLV4_ADDR = 0x6A, 0x24, 0x67, 0x34, 0x31
 SLV0_CTRL, EXT = 0x27, 0x49
-MST_EN, ENABLE = 0x20, 0x80
+MST_EN, ENABLE, READ = 0x20, 0x80, 0x80
 
 
 class Device:
@@ -101,6 +99,17 @@ def aux(imu, device):
     return aux
 
 
+@pytest.fixture
+def remote(aux):
+    """The device's registers, as a driver has them."""
+    return aux.device(0x1E)
+
+
+@pytest.fixture
+def nobody(aux):
+    return aux.device(0x2A)
+
+
 def samples(imu, n=1):
     """n ticks of a timer at the sample rate."""
     for _ in range(n):
@@ -108,32 +117,24 @@ def samples(imu, n=1):
         imu.read()
 
 
-def counted(imu, monkeypatch):
-    """A list that grows by one for every register access of the driver."""
-    accesses = []
-    read, write = imu.registers.read_into, imu.registers.write
-
-    def counting_read(register, buffer):
-        accesses.append(register)
-        read(register, buffer)
-
-    def counting_write(register, value):
-        accesses.append(register)
-        write(register, value)
-
-    monkeypatch.setattr(imu.registers, "read_into", counting_read)
-    monkeypatch.setattr(imu.registers, "write", counting_write)
-    return accesses
-
-
-def carry_out(imu, aux):
-    """poll() after every sample until there is an outcome; (outcome, calls)."""
+def carry_out(imu, device, register, data=-1):
+    """transact() after every sample until there is an outcome; (outcome, calls)."""
     for calls in range(1, 30):
         samples(imu)
-        outcome = aux.poll()
+        outcome = device.transact(register, data)
         if outcome != AUX_BUSY:
             return outcome, calls
     raise AssertionError("never done")
+
+
+@pytest.fixture
+def accesses(imu, monkeypatch):
+    """A list that grows by one for every register access of the driver."""
+    made = []
+    bus, read, write = imu.registers, imu.registers.read_into, imu.registers.write
+    monkeypatch.setattr(bus, "read_into", lambda r, b: made.append(r) or read(r, b))
+    monkeypatch.setattr(bus, "write", lambda r, v: made.append(r) or write(r, v))
+    return made
 
 
 # Set-up
@@ -147,38 +148,55 @@ def test_begin_switches_the_master_on_at_400_khz_with_shadowing_and_without_wait
     assert aux.running
 
 
-def test_a_byte_is_written_and_read(aux, device):
-    aux.write_register(0x1E, 0x41, 0x24)
+def test_a_device_has_what_registers_offer_on_any_bus(remote, device):
+    remote.write_register(0x41, 0x24)
     assert device.registers[0x41] == 0x24
-    assert aux.read_register(0x1E, 0x41) == 0x24
-    assert aux.read_register(0x1E, 0x10) == device.registers[0x10]
+    assert remote.read_register(0x41) == 0x24
+    remote.verify_register(0x41, 0x2F, mask=0xF0)
+    with pytest.raises(AuxiliaryError, match="register 0x41: wrote 0x25, read 0x24"):
+        remote.verify_register(0x41, 0x25)
+    buffer = bytearray(5)
+    remote.read_into(0x10, buffer)
+    assert buffer == device.registers[0x10:0x15]
+    remote.write_from(b"\x50\x01\x02\x03")
+    assert device.registers[0x50:0x53] == b"\x01\x02\x03"
 
 
-def test_nobody_there_and_nothing_done_are_told_apart_and_named(imu, aux):
+def test_no_acknowledge_and_nothing_done_are_told_apart_and_named(imu, remote, nobody):
     with pytest.raises(AuxiliaryNack, match=r"a read of register 0x05 of 0x2a"):
-        aux.read_register(0x2A, 0x05)
+        nobody.read_into(0x05, bytearray(1))
     with pytest.raises(AuxiliaryNack, match=r"a write to register 0x06 of 0x2a"):
-        aux.write_register(0x2A, 0x06, 1)
+        nobody.write(0x06, 1)
     imu.sleep()
     kernel.advance(5000)
     before = kernel.now()
     with pytest.raises(AuxiliaryTimeout, match=r"register 0x05 of 0x1e not done in .* awake"):
-        aux.read_register(0x1E, 0x05)
+        remote.read_into(0x05, bytearray(1))
     assert kernel.now() - before < 20_000
     assert not imu.model.register(SLV4_CTRL) & ENABLE  # it does not come later, unasked
 
 
-def test_after_a_time_out_the_next_transaction_is_not_taken_for_the_old_one(imu, aux, device):
+def test_after_a_time_out_the_next_transaction_is_not_taken_for_the_old_one(imu, remote, device):
     imu.sleep()
     with pytest.raises(AuxiliaryTimeout):
-        aux.read_register(0x1E, 0x05)
+        remote.read_into(0x05, bytearray(1))
     imu.wake()
-    assert aux.read_register(0x1E, 0x06) == device.registers[0x06]
+    assert remote.read_register(0x06) == device.registers[0x06]
+
+
+@pytest.mark.parametrize("imu", [on_i2c, the_6500_on_i2c], indirect=True)  # SPI cannot tell
+def test_a_bus_that_fails_at_set_up_ends_in_good_time_and_is_blamed(imu, remote):
+    imu.model.vanish()
+    before = kernel.now()
+    with pytest.raises(AuxiliaryTimeout, match="IMU awake, does it answer"):
+        remote.read_into(0x05, bytearray(1))
+    assert kernel.now() - before < 20_000
+    assert imu.errors
 
 
 def test_before_begin_there_is_no_bus(imu, device):
     aux = AuxiliaryBus(imu)
-    for call in (aux.start, aux.stop, lambda: aux.read_register(0x1E, 0)):
+    for call in (aux.start, lambda: aux.device(0x1E).read_register(0)):
         with pytest.raises(AuxiliaryError, match="begin"):
             call()
 
@@ -255,7 +273,7 @@ def test_other_slots_get_their_places_anew(imu, aux, device):
     aux.periodic_read(0x1E, 0x30, 2)
     aux.start()
     samples(imu, 3)
-    aux.stop()
+    aux.begin()
     samples(imu, 2)
     reads = device.reads
     samples(imu, 2)
@@ -274,7 +292,7 @@ def test_fewer_slots_leave_no_old_one_running(imu, aux, device):
     for register in (0x20, 0x30, 0x40):
         aux.periodic_read(0x1E, register, 1)
     aux.start()
-    aux.stop()
+    aux.begin()
     aux.periodic_read(0x1E, 0x20, 1)
     aux.start()
     samples(imu, 2)
@@ -300,22 +318,18 @@ def test_a_divided_slot_runs_every_nth_sample_and_the_others_with_each(imu, aux,
     assert all(abs(gap - 10_000) <= 2 for gap in gaps)
 
 
-def test_the_shared_delay_survives_every_transaction_of_slot_4(imu, aux, device):
+def test_the_shared_delay_survives_every_transaction_of_slot_4(imu, aux, remote, nobody):
     aux.periodic_write(0x1E, 0x0A, 1, every=10)
     aux.start()
     imu.model.log = log = []
-    aux.write_register(0x1E, 0x41, 0x24)
-    aux.read_register(0x1E, 0x41)
-    for post in (
-        lambda: aux.post_read(0x1E, 1),
-        lambda: aux.post_write(0x1E, 2, 3),
-        lambda: aux.post_read(0x2A, 1),  # nobody there
-    ):
-        post()
-        carry_out(imu, aux)
+    remote.write_register(0x41, 0x24)
+    remote.read_register(0x41)
+    carry_out(imu, remote, 1)
+    carry_out(imu, remote, 2, 3)
+    carry_out(imu, nobody, 1)
     imu.sleep()
     with pytest.raises(AuxiliaryTimeout):
-        aux.read_register(0x1E, 0x05)
+        remote.read_into(0x05, bytearray(1))
     written = [value for _, register, value in log if register == SLV4_CTRL]
     assert len(written) >= 6
     assert {value & 0x1F for value in written} == {9}
@@ -361,140 +375,109 @@ def test_slots_that_do_not_fit_into_a_sample_are_refused():
 # The tick
 
 
-def test_a_read_in_the_tick_brings_the_byte_in_three_calls_of_two_accesses(
-    imu, aux, device, monkeypatch
+@pytest.mark.parametrize("data, most", [(-1, 3), (0x24, 4)])
+def test_a_transaction_in_the_tick_takes_a_few_calls_of_two_accesses(
+    imu, remote, device, accesses, data, most
 ):
     samples(imu, 2)
-    accesses = counted(imu, monkeypatch)
     for register in (0x10, 0x11, 0x12):
-        aux.post_read(0x1E, register)
-        calls = 0
-        outcome = AUX_BUSY
+        outcome, calls = AUX_BUSY, 0
         while outcome == AUX_BUSY:
             calls += 1
             kernel.advance(1000)
             accesses.clear()
-            outcome = aux.poll()
-            assert len(accesses) <= 2
-        assert outcome == AUX_DONE
-        assert aux.value == device.registers[register]
-        assert calls <= 3
-    assert aux.poll() == AUX_IDLE
-
-
-def test_a_write_in_the_tick(imu, aux, device, monkeypatch):
-    aux.post_write(0x1E, 0x41, 0x24)
-    accesses = counted(imu, monkeypatch)
-    calls = 0
-    outcome = AUX_BUSY
-    while outcome == AUX_BUSY:
-        calls += 1
-        kernel.advance(1000)
-        accesses.clear()
-        outcome = aux.poll()
-        assert len(accesses) <= 2
-    assert outcome == AUX_DONE
-    assert calls <= 4
-    assert device.registers[0x41] == 0x24
+            outcome = remote.transact(register, data)
+            assert 1 <= len(accesses) <= 2
+        assert calls <= most
+        if data < 0:
+            assert outcome == device.registers[register]
+        else:
+            assert outcome == 0 and device.registers[register] == data
 
 
 @pytest.mark.parametrize("done_with_nack", [True, False])
-def test_no_acknowledge_in_the_tick_is_told(imu, aux, device, done_with_nack):
+def test_no_acknowledge_in_the_tick_is_told(imu, remote, nobody, device, done_with_nack):
     imu.model.master.done_with_nack = done_with_nack
-    aux.post_read(0x2A, 0x10)
-    assert carry_out(imu, aux)[0] == AUX_NACK
-    assert aux.faults & 0x10
+    assert carry_out(imu, nobody, 0x10)[0] == AUX_NACK
+    assert nobody.errors == 1
     assert not imu.model.register(SLV4_CTRL) & ENABLE
-    aux.post_read(0x1E, 0x10)
-    assert carry_out(imu, aux)[0] == AUX_DONE
-    assert aux.value == device.registers[0x10]
+    assert carry_out(imu, remote, 0x10)[0] == device.registers[0x10]
+    assert remote.errors == 0
 
 
-def test_a_master_that_sleeps_is_given_up_and_nothing_comes_late(imu, aux, device):
+def test_a_master_that_sleeps_is_given_up_and_nothing_comes_late(imu, remote, device):
     imu.sleep()
-    aux.post_read(0x1E, 0x10)
-    outcome, calls = carry_out(imu, aux)
+    outcome, calls = carry_out(imu, remote, 0x10)
     assert outcome == AUX_TIMEOUT
     assert calls <= 17
     assert device.reads == 0
     imu.wake()
     samples(imu, 5)
     assert device.reads == 0
-    aux.post_read(0x1E, 0x11)
-    assert carry_out(imu, aux)[0] == AUX_DONE
-    assert aux.value == device.registers[0x11]
+    assert carry_out(imu, remote, 0x11)[0] == device.registers[0x11]
 
 
 @pytest.mark.parametrize("imu", [on_i2c, the_6500_on_i2c], indirect=True)  # SPI cannot tell
-def test_a_bus_that_fails_in_the_tick_is_counted_and_tried_again(imu, aux, device):
-    aux.post_read(0x1E, 0x10)
+def test_a_bus_that_fails_in_the_tick_is_counted_and_tried_again(imu, remote, device):
     imu.model.vanish()
     for _ in range(3):
-        assert aux.poll() == AUX_BUSY
+        assert remote.transact(0x10, -1) == AUX_BUSY
     assert imu.errors == 6
     imu.model.come_back()
-    assert carry_out(imu, aux)[0] == AUX_DONE
-    assert aux.value == device.registers[0x10]
-    aux.post_read(0x1E, 0x11)
+    assert carry_out(imu, remote, 0x10)[0] == device.registers[0x10]
     samples(imu)
-    aux.poll()  # it is on its way
+    remote.transact(0x11, -1)  # it is on its way
     imu.model.vanish()
-    for _ in range(15):
-        assert aux.poll() == AUX_BUSY
-    assert aux.poll() == AUX_TIMEOUT  # never without end
+    outcomes = [remote.transact(0x11, -1) for _ in range(16)]
+    assert outcomes == [AUX_BUSY] * 15 + [AUX_TIMEOUT]  # never without end
     imu.model.come_back()
     samples(imu)
     kernel.advance(1)
-    aux.post_read(0x1E, 0x12)
-    cycles = device.reads
-    while aux.poll() == AUX_BUSY and device.reads == cycles:
-        pass
-    assert device.reads > cycles  # the old one's SLV4_DONE was not taken for this one's
-    assert carry_out(imu, aux)[0] in (AUX_DONE, AUX_IDLE)
-    assert aux.value == device.registers[0x12]
+    # the old one's SLV4_DONE is not taken for this one's
+    assert carry_out(imu, remote, 0x12)[0] == device.registers[0x12]
 
 
-def test_a_transaction_that_was_not_waited_for_is_not_taken_for_the_next(imu, aux, device):
+def test_a_transaction_that_was_not_waited_for_is_not_taken_for_the_next(imu, remote, device):
     for register in (0x10, 0x11, 0x12, 0x13):
-        aux.post_read(0x1E, register)
         for _ in range(2):
             samples(imu)
-            assert aux.poll() == AUX_BUSY
+            assert remote.transact(register, -1) == AUX_BUSY
     samples(imu, 2)
-    aux.post_read(0x1E, 0x14)
-    assert carry_out(imu, aux)[0] == AUX_DONE
-    assert aux.value == device.registers[0x14]
+    assert carry_out(imu, remote, 0x14)[0] == device.registers[0x14]
 
 
-def test_a_reset_of_the_imu_in_the_middle_does_not_confuse_it(imu, aux, device):
+def test_a_reset_of_the_imu_in_the_middle_does_not_confuse_it(imu, remote, device):
     imu.model.power_up_us = 2000
-    aux.post_read(0x1E, 0x10)
     samples(imu)
-    aux.poll()
+    remote.transact(0x10, -1)
     imu.model.brown_out()
     for _ in range(200):
         samples(imu)
         imu.health()
     assert imu.resets == 1
     assert imu.model.register(USER_CTRL) & MST_EN
-    assert carry_out(imu, aux)[0] == AUX_DONE
-    assert aux.value == device.registers[0x10]
+    assert carry_out(imu, remote, 0x10)[0] == device.registers[0x10]
     assert imu.model.misuse == []
 
 
-def test_what_the_status_register_forgets_is_kept(imu, aux, device):
+def test_what_the_status_register_forgets_is_kept(imu, aux, remote, device):
     aux.periodic_read(0x1E, 0x10, 1)
     aux.periodic_read(0x2A, 0x10, 1)  # nobody there
     aux.start()
     samples(imu, 3)
-    aux.post_read(0x1E, 0x20)
-    assert carry_out(imu, aux)[0] == AUX_DONE
+    outcome = AUX_BUSY
+    while outcome == AUX_BUSY:
+        samples(imu)
+        outcome = aux.transact(0x1E | READ, 0x20, 0)
+    assert outcome == device.registers[0x20]
     assert aux.faults & 0x0F == 0x02
     device.gone = True
     samples(imu, 3)
     with pytest.raises(AuxiliaryNack):
-        aux.read_register(0x1E, 0x20)  # the set-up's looks count as well
+        remote.read_into(0x20, bytearray(1))  # the set-up's looks count as well
     assert aux.faults == 0x13
+    carry_out(imu, remote, 0x20)
+    assert remote.errors == 1 and aux.faults == 0  # counted, and done with
 
 
 def test_everything_that_was_set_up_comes_back_after_a_reset_of_the_imu(imu, aux, device):
@@ -502,15 +485,14 @@ def test_everything_that_was_set_up_comes_back_after_a_reset_of_the_imu(imu, aux
     aux.periodic_write(0x1E, 0x0A, 1, every=10)
     aux.start()
     samples(imu, 20)
-    before = [imu.model.register(r) for r in (*range(0x24, 0x2D), SLV4_CTRL, 0x64, DELAY_CTRL)]
+    rows = (*range(0x24, 0x2D), SLV4_CTRL, 0x64, DELAY_CTRL)
+    before = [imu.model.register(r) for r in rows]
     imu.model.brown_out()
     for _ in range(300):
         samples(imu)
         imu.health()
-    after = [imu.model.register(r) for r in (*range(0x24, 0x2D), SLV4_CTRL, 0x64, DELAY_CTRL)]
-    assert after == before
+    assert [imu.model.register(r) for r in rows] == before
     assert imu.resets == 1
-    assert imu.read() is not None
     there = bytearray(3)
     imu.registers.read_into(EXT, there)
     assert there == device.registers[0x20:0x23]

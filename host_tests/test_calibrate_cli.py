@@ -496,7 +496,9 @@ def test_what_the_board_records_calibrates_it(run, out, tmp_path, board, capsys)
 
 
 class OwnMagnetometer:
-    """A magnetometer that is read by itself, as IST8310_I2C: a new sample with every read."""
+    """A magnetometer on a bus of its own: a new sample with every read."""
+
+    own_bus = True
 
     chip = "IST8310"
     sample_rate = (100, 1)

@@ -560,7 +560,7 @@ def test_with_upright_in_the_firmware_only_main_and_board_are_installed(board):
     ("", {"inertial", "inertial_kernels"}, {"mahony", "ist8310", "dmp", "kalman", "mpu_selftest"}),
     ('FILTER = "kalman6"', {"kalman", "euler_kernels", "fixmath"}, {"inertial", "dmp"}),
     ('FILTER = "dmp6"\nfrom upright import mpu6500', {"dmp", "dmp_image", "mpu6500"}, {"mahony"}),
-    ("FILTER = None\ndef f():\n    from upright import ist8310", {"inertial", "ist8310", "auxiliary_bus"}, {"mahony"}),
+    ("FILTER = None\ndef f():\n    from upright import ist8310", {"inertial", "ist8310", "magnetometer"}, {"mahony"}),
     ("import os\nFILTER = os.environ", {"inertial", "mahony", "quaternion_kalman", "dmp"}, {"ist8310"}),
     ("from upright.mpu_selftest import run", {"inertial", "mpu_selftest"}, {"mahony"}),
 ])  # fmt: skip

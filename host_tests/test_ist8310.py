@@ -10,9 +10,10 @@ from chips.ist8310 import IST8310Chip
 from chips.mpu6050 import MPU6050Chip
 from chips.mpu6500 import MPU6500Chip
 from upright.auxiliary_bus import AuxiliaryBus
-from upright.ist8310 import IST8310, IST8310_I2C, IST8310Error
+from upright.ist8310 import IST8310, IST8310Error
 from upright.mpu6050 import MPU6050
 from upright.mpu6500 import MPU6500, MPU6500_I2C
+from upright.registers import I2CRegisters
 from world import StillWorld
 
 FRESH, MAG_FRESH = 1, 2
@@ -30,7 +31,8 @@ class Moving(StillWorld):
 
 
 class Rig:
-    """An IMU with an IST8310 behind it, and the tick of the firmware: read, and health now and then."""
+    """An IMU with an IST8310 behind it, or on a bus of its own, and the tick of the firmware: read, and health now and
+    then."""
 
     def __init__(self, kind, world=None, rate=1000):
         self.world = world or StillWorld((10, -20, 4096, 5, 6, -7, *FIELD, -521))
@@ -40,23 +42,37 @@ class Rig:
             cs = machine.Pin("PF6", machine.Pin.OUT, value=1)
             self.imu = MPU6500(machine.SPI(5, 1_000_000), cs)
         else:
-            kinds = {"i2c": (MPU6050Chip, MPU6050), "6500 on i2c": (MPU6500Chip, MPU6500_I2C)}
-            model, driver = kinds[kind]
+            model, driver = MPU6050Chip, MPU6050
+            if kind == "6500 on i2c":
+                model, driver = MPU6500Chip, MPU6500_I2C
             self.chip = model(self.world)
             machine.wire_i2c(0, self.chip)
             self.imu = driver(machine.I2C(0, freq=400_000))
         self.mag_chip = IST8310Chip(self.world)
-        self.chip.aux.append(self.mag_chip)
         self.imu.configure(sample_rate_hz=rate)
+        self.rate = rate
         self.period = 1_000_000 // rate
-        self.mag = IST8310(AuxiliaryBus(self.imu))
+        if kind == "own bus":
+            self.bus = machine.wire_i2c(1, self.mag_chip)
+            self.where = ""
+            self.mag = IST8310(machine.I2C(1, freq=400_000))
+        else:
+            self.chip.aux.append(self.mag_chip)
+            self.where = f" behind the {self.imu.chip}"
+            self.mag = IST8310(AuxiliaryBus(self.imu))
         self.steps = 0
 
-    def tick(self):
+    def configure(self, **arguments):
+        self.mag.configure(sample_rate=self.rate if self.mag.own_bus else None, **arguments)
+
+    def tick(self, health=True):
         kernel.advance(self.period - kernel.now() % self.period)
-        flags = self.imu.read()
+        self.imu.read()
+        if self.mag.own_bus:
+            self.mag.read(self.imu.counts)
+        flags = self.imu.counts[10]
         self.steps += 1
-        if not flags & FRESH or not self.steps % 8:
+        if health and (not flags & FRESH or not self.steps % 8):
             self.imu.health()
         return flags
 
@@ -73,12 +89,22 @@ class Rig:
         raise AssertionError(f"no bit {bit} in {most} ticks")
 
 
-KINDS = ("spi", "i2c", "6500 on i2c")
+BEHIND = ("spi", "i2c", "6500 on i2c")
 
 
-@pytest.fixture(params=KINDS)
+@pytest.fixture(params=(*BEHIND, "own bus"))
 def rig(request):
     return Rig(request.param)
+
+
+@pytest.fixture(params=BEHIND)
+def behind(request):
+    return Rig(request.param)
+
+
+@pytest.fixture
+def own():
+    return Rig("own bus", rate=200)
 
 
 def gaps(ticks):
@@ -91,7 +117,7 @@ def gaps(ticks):
 def test_configure_finds_resets_and_configures_it(rig):
     rig.mag_chip.log = log = []
     start = kernel.now()
-    rig.mag.configure()
+    rig.configure()
     took = kernel.now() - start
     written = {register: value for _, register, value in log if register != CNTL1}
     assert written == {CNTL2: 0x0C, AVGCNTL: 0x24, PDCNTL: 0xC0}
@@ -107,8 +133,8 @@ def test_configure_finds_resets_and_configures_it(rig):
 def test_an_absent_magnetometer_is_named_in_good_time(rig):
     rig.mag_chip.vanish()
     start = kernel.now()
-    with pytest.raises(IST8310Error, match=r"no IST8310 at 0x0e behind the MPU6.*acknowledge"):
-        rig.mag.configure()
+    with pytest.raises(IST8310Error, match=rf"no IST8310 at 0x0e{rig.where} \("):
+        rig.configure()
     assert kernel.now() - start < 150_000
     assert not rig.mag.present
 
@@ -116,18 +142,18 @@ def test_an_absent_magnetometer_is_named_in_good_time(rig):
 def test_a_magnetometer_that_is_late_after_power_up_is_waited_for(rig):
     rig.mag_chip.power_up_us = 50_000
     rig.mag_chip.brown_out(kernel.now())
-    rig.mag.configure()
+    rig.configure()
 
 
 def test_another_chip_at_its_address_is_refused_and_shown(rig):
     rig.mag_chip.stick(WAI, 0x48)
-    with pytest.raises(IST8310Error, match=r"0x0e behind the MPU6.*0x48.*0x10"):
-        rig.mag.configure()
+    with pytest.raises(IST8310Error, match=rf"0x0e{rig.where} .*0x48.*0x10.*another chip"):
+        rig.configure()
 
 
 def test_an_identity_that_was_overwritten_is_mended_by_a_reset(rig):
     rig.mag_chip._registers[WAI] = 0x55
-    rig.mag.configure()
+    rig.configure()
     assert rig.run(30)
 
 
@@ -135,19 +161,42 @@ def test_an_identity_that_was_overwritten_is_mended_by_a_reset(rig):
 def test_a_register_that_does_not_keep_its_value_is_reported(rig, register):
     rig.mag_chip.stick(register, 0x00)
     with pytest.raises(IST8310Error, match=rf"register 0x{register:02x} .* read 0x00"):
-        rig.mag.configure()
+        rig.configure()
 
 
 def test_a_magnetometer_stuck_in_reset_is_reported(rig):
     rig.mag_chip.stick(CNTL2, 0x01)
     with pytest.raises(IST8310Error, match="did not come out of reset"):
-        rig.mag.configure()
+        rig.configure()
 
 
-def test_an_imu_that_sleeps_is_blamed_and_not_the_magnetometer(rig):
-    rig.imu.sleep()
+def test_a_chip_that_shares_an_address_is_not_said_to_be_an_ist8310(rig):
+    """A QMC5883L sits at 0x0D, as an IST8310 can; its register 0x0B (SET/RESET period) keeps what is written to it."""
+    rig.mag_chip.address = 0x0D
+    rig.mag_chip.stick(WAI, 0x55)
+    rig.mag_chip.stick(CNTL2, 0x01)
+    bus = machine.I2C(1, freq=400_000) if rig.mag.own_bus else AuxiliaryBus(rig.imu)
+    with pytest.raises(IST8310Error, match=rf"0x0d{rig.where} answers .*another chip"):
+        IST8310(bus, 0x0D).configure()
+
+
+def test_an_imu_that_sleeps_is_blamed_and_not_the_magnetometer(behind):
+    behind.imu.sleep()
     with pytest.raises(IST8310Error, match="IMU awake"):
-        rig.mag.configure()
+        behind.configure()
+
+
+def test_a_bus_can_be_given_as_the_chips_registers():
+    chip = IST8310Chip(StillWorld((0, 0, 4096, 0, 0, 0, *FIELD)))
+    machine.wire_i2c(1, chip)
+    mag = IST8310(I2CRegisters(machine.I2C(1, freq=400_000), 0x0E))
+    mag.configure()
+    assert mag.own_bus and mag.present
+    chip.stick(AVGCNTL, 0)
+    with pytest.raises(IST8310Error, match="register 0x41 of the IST8310"):
+        mag.configure()
+    with pytest.raises(TypeError, match="AuxiliaryBus"):
+        IST8310(5)
 
 
 @pytest.mark.parametrize(
@@ -195,7 +244,7 @@ def test_what_the_chip_cannot_do_is_refused(arguments, what):
 
 
 def test_every_measurement_is_delivered_once(rig):
-    rig.mag.configure()
+    rig.configure()
     rig.until(MAG_FRESH)
     ticks = rig.run(1000)
     assert len(ticks) == 100
@@ -208,18 +257,36 @@ def test_every_measurement_is_delivered_once(rig):
     assert rig.chip.misuse == rig.mag_chip.misuse == []
 
 
+@pytest.mark.parametrize("kind", ["spi", "own bus"])
 @pytest.mark.parametrize("rate, n", [(500, 5), (250, 3), (200, 2), (100, 2)])
-def test_other_sample_rates_of_the_imu(rate, n):
-    rig = Rig("spi", rate=rate)
-    rig.mag.configure(rate_hz=100)
+def test_other_sample_rates_of_the_imu(kind, rate, n):
+    rig = Rig(kind, rate=rate)
+    rig.configure(rate_hz=100)
     rig.until(MAG_FRESH)
-    ticks = rig.run(200)
+    ticks = rig.run(300)
     assert gaps(ticks) == {n}
-    assert rig.mag.stale == 0
+    assert (rig.mag.stale, rig.mag.errors, rig.mag.resets) == (0, 0, 0)
+    assert rig.mag.sample_rate[0] * n == rate * rig.mag.sample_rate[1]
+
+
+def test_a_program_gets_microteslas(rig):
+    assert rig.mag.field() is None
+    rig.configure()
+    assert rig.mag.field() is None
+    rig.until(MAG_FRESH)
+    assert rig.mag.field() == pytest.approx((100 / 3.3, -200 / 3.3, 300 / 3.3))
+
+
+def test_read_does_nothing_where_the_imu_brings_the_measurement(behind):
+    behind.configure()
+    behind.until(MAG_FRESH)
+    counts = array("h", range(11))
+    assert behind.mag.read(counts) == 10
+    assert list(counts) == list(range(11))
 
 
 def test_between_measurements_the_words_stay_and_bit_1_is_clear(rig):
-    rig.mag.configure()
+    rig.configure()
     rig.until(MAG_FRESH)
     rig.world.set((0, 0, 4096, 0, 0, 0, 7, 8, 9))
     flags = rig.tick()
@@ -229,25 +296,25 @@ def test_between_measurements_the_words_stay_and_bit_1_is_clear(rig):
     assert tuple(rig.imu.counts[6:9]) == (7, 8, 9)
 
 
-def test_the_fifo_carries_it_too(rig):
-    rig.mag.configure()
-    rig.imu.fifo_enable(batch=10)
+def test_the_fifo_carries_it_too(behind):
+    behind.configure()
+    behind.imu.fifo_enable(batch=10)
     fresh = packets = 0
     for _ in range(100):
         kernel.advance(10_000 - kernel.now() % 10_000)
-        for _ in range(rig.imu.fifo_poll()):
-            flags = rig.imu.fifo_next()
+        for _ in range(behind.imu.fifo_poll()):
+            flags = behind.imu.fifo_next()
             packets += flags & FRESH
             fresh += flags >> 1 & 1
-        rig.imu.health()
+        behind.imu.health()
     assert packets > 950
     assert abs(fresh - packets // 10) <= 2
-    assert rig.imu.fifo_overflows == rig.mag.stale == rig.imu.resets == 0
-    assert tuple(rig.imu.counts[6:9]) == FIELD
+    assert behind.imu.fifo_overflows == behind.mag.stale == behind.imu.resets == 0
+    assert tuple(behind.imu.counts[6:9]) == FIELD
 
 
 def test_a_field_beyond_the_range_is_withheld_and_counted(rig):
-    rig.mag.configure()
+    rig.configure()
     rig.until(MAG_FRESH)
     for word in range(3):
         field = [0, 0, 0]
@@ -267,10 +334,28 @@ def test_a_field_beyond_the_range_is_withheld_and_counted(rig):
     assert rig.mag.stale == 0
 
 
+@pytest.mark.parametrize("axis, most", [(0, 5280), (1, 5280), (2, 8250)])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_range_of_each_axis_is_the_data_sheets(axis, most, sign):
+    """1600 uT for x and y, 2500 uT for z (DS 4.4)."""
+    rig = Rig("own bus")
+    rig.configure()
+    field = [0, 0, 0]
+    for value, delivered in ((most, True), (most + 1, False)):
+        field[axis] = sign * value
+        raw = b"\x01" + array("h", field).tobytes()
+        assert rig.mag.take(raw, 0, rig.imu.counts) == (MAG_FRESH if delivered else 0)
+    assert rig.imu.counts[6 + axis] == sign * most
+    assert rig.mag.field()[axis] == pytest.approx(
+        sign * most / 3.3
+    )  # of the last one that was delivered
+    assert (rig.mag.fresh, rig.mag.saturated) == (1, 1)
+
+
 @pytest.mark.parametrize("took", range(5500, 6121, 40))
 def test_a_measurement_that_ends_at_any_moment_of_the_round_is_delivered_once_and_whole(took):
     rig = Rig("i2c", Moving())
-    rig.mag.configure()
+    rig.configure()
     rig.mag_chip.measure_us = took
     rig.until(MAG_FRESH)
     rig.run(20)
@@ -287,13 +372,12 @@ def test_a_measurement_that_ends_at_any_moment_of_the_round_is_delivered_once_an
 def test_without_dren_measurements_are_still_found_by_their_data():
     """The IST8310 example that is widely copied writes CNTL2 = 0, and with it DRDY is never set."""
     rig = Rig("i2c", Moving())
-    rig.mag.configure()
+    rig.configure()
     rig.until(MAG_FRESH)
     rig.mag_chip.poke(CNTL2, 0)
     fresh = rig.mag.fresh
     for _ in range(100):
-        kernel.advance(1000 - kernel.now() % 1000)
-        rig.imu.read()
+        rig.tick(health=False)
     assert abs(rig.mag.fresh - fresh - 10) <= 1
     assert rig.mag.unflagged >= 9
 
@@ -308,58 +392,57 @@ def read_only(rig, n):
     fresh = rig.mag.fresh
     stale = rig.mag.stale
     for _ in range(n):
-        kernel.advance(1000 - kernel.now() % 1000)
-        rig.imu.read()
+        rig.tick(health=False)
     return rig.mag.fresh - fresh, rig.mag.stale - stale
 
 
-def test_triggers_that_come_too_fast_show_as_stale(rig):
-    rig.mag.configure()
-    rig.mag_chip.restarts = True  # each begins the measurement anew
-    rig.until(MAG_FRESH)
-    assert read_only(rig, 100) == (10, 0)
-    trigger_every_4_samples(rig)
-    read_only(rig, 10)
-    fresh, stale = read_only(rig, 1000)
+def test_triggers_that_come_too_fast_show_as_stale(behind):
+    behind.configure()
+    behind.mag_chip.restarts = True  # each begins the measurement anew
+    behind.until(MAG_FRESH)
+    assert read_only(behind, 100) == (10, 0)
+    trigger_every_4_samples(behind)
+    read_only(behind, 10)
+    fresh, stale = read_only(behind, 1000)
     assert (fresh, stale) == (0, 100)
 
 
-def test_a_driver_that_believed_in_4_ms_would_count_every_second_one_as_stale(rig):
-    rig.mag.configure()  # it refuses rate_hz=250
-    trigger_every_4_samples(rig)  # the ones in between are lost
-    rig.mag._state[7] = 4  # the samples that it expects between two measurements,
-    rig.mag._state[6] = 4 + 3  # and those that it waits
-    read_only(rig, 20)
-    fresh, stale = read_only(rig, 1000)
+def test_a_driver_that_believed_in_4_ms_would_count_every_second_one_as_stale(behind):
+    behind.configure()  # it refuses rate_hz=250
+    trigger_every_4_samples(behind)  # the ones in between are lost
+    behind.mag._state[7] = 4  # the samples that it expects between two measurements,
+    behind.mag._state[6] = 4 + 3  # and those that it waits
+    read_only(behind, 20)
+    fresh, stale = read_only(behind, 1000)
     assert fresh == 125 and stale == 125  # of the 250 that were asked for
 
 
-def test_health_puts_the_period_right(rig):
-    rig.mag.configure()
-    rig.run(20)
-    trigger_every_4_samples(rig)
-    rig.run(600)
-    assert rig.chip.register(SLV4_CTRL) & 0x1F == 9
-    assert rig.imu.resets <= 1  # where a transaction of slot 4 has not put it right before
-    assert gaps(rig.run(200)) == {10}
+def test_health_puts_the_period_right(behind):
+    behind.configure()
+    behind.run(20)
+    trigger_every_4_samples(behind)
+    behind.run(600)
+    assert behind.chip.register(SLV4_CTRL) & 0x1F == 9
+    assert behind.imu.resets <= 1  # where a transaction of slot 4 has not put it right before
+    assert gaps(behind.run(200)) == {10}
 
 
-def test_bytes_that_a_silent_magnetometer_leaves_behind_are_not_used_again(rig):
-    rig.mag.configure()
+def test_bytes_that_a_silent_magnetometer_leaves_behind_are_not_used_again(behind):
+    behind.configure()
     for phase in range(12):
-        rig.until(MAG_FRESH)
+        behind.until(MAG_FRESH)
         for _ in range(phase):
-            rig.tick()
-        rig.mag_chip.vanish()
-        rig.tick()
-        fresh, stale = read_only(rig, 60)
+            behind.tick()
+        behind.mag_chip.vanish()
+        behind.tick()
+        fresh, stale = read_only(behind, 60)
         assert fresh == 0 and stale >= 4
-        rig.mag_chip.come_back()
-        rig.until(MAG_FRESH)
+        behind.mag_chip.come_back()
+        behind.until(MAG_FRESH)
 
 
 def test_a_bus_that_nobody_drives_is_no_measurement(rig):
-    rig.mag.configure()
+    rig.configure()
     rig.until(MAG_FRESH)
     counts = rig.imu.counts
     for status, byte in ((0xFF, 0xFF), (0x00, 0x00), (0x01 | 0x80, 0x12), (0x00, 0x00)):
@@ -374,14 +457,14 @@ def test_a_bus_that_nobody_drives_is_no_measurement(rig):
 def test_absent_at_the_start_it_is_found_and_configured_by_the_tick(rig):
     rig.mag_chip.vanish()
     with pytest.raises(IST8310Error):
-        rig.mag.configure()
+        rig.configure()
     rig.mag.attach()
     assert rig.run(500) == []
     assert rig.imu.counts[10] & FRESH
     assert rig.imu.errors == rig.imu.resets == 0
     assert not rig.mag.present
     assert rig.mag.errors > 5
-    assert rig.mag.stale > 40
+    assert rig.mag.stale > (35 if rig.mag.own_bus else 40)
     rig.mag_chip.come_back()
     rig.mag_chip.misuse.clear()  # until then it was triggered as it came
     assert rig.until(MAG_FRESH) < 500_000
@@ -394,7 +477,7 @@ def test_absent_at_the_start_it_is_found_and_configured_by_the_tick(rig):
 
 
 def test_vanishing_in_flight_and_coming_back(rig):
-    rig.mag.configure()
+    rig.configure()
     rig.until(MAG_FRESH)
     rig.mag_chip.vanish()
     rig.run(2)
@@ -412,7 +495,7 @@ def test_vanishing_in_flight_and_coming_back(rig):
 
 
 def test_a_reset_of_the_magnetometer_alone_is_noticed_and_mended(rig):
-    rig.mag.configure()
+    rig.configure()
     rig.until(MAG_FRESH)
     rig.mag_chip.power_up_us = 50_000
     rig.mag_chip.brown_out(kernel.now())
@@ -427,7 +510,7 @@ def test_a_reset_of_the_magnetometer_alone_is_noticed_and_mended(rig):
 
 @pytest.mark.parametrize("both", [False, True])
 def test_a_reset_of_the_imu_in_flight(rig, both):
-    rig.mag.configure()
+    rig.configure()
     rig.until(MAG_FRESH)
     rig.chip.log = log = []
     rig.chip.brown_out(kernel.now())
@@ -449,7 +532,7 @@ def test_a_reset_of_the_imu_in_flight(rig, both):
 
 
 def test_an_identity_lost_in_flight_is_mended_by_a_soft_reset(rig):
-    rig.mag.configure()
+    rig.configure()
     rig.until(MAG_FRESH)
     rig.mag_chip._registers[WAI] = 0x11
     rig.run(1000)
@@ -460,29 +543,29 @@ def test_an_identity_lost_in_flight_is_mended_by_a_soft_reset(rig):
 
 
 def test_while_a_register_is_wrong_nothing_is_delivered(rig):
-    rig.mag.configure()
+    rig.configure()
     rig.until(MAG_FRESH)
     rig.mag_chip.stick(PDCNTL, 0x00)
-    rig.run(400)
-    assert rig.run(600) == []
+    while not rig.mag.resets:
+        rig.tick()
+    assert rig.run(1000) == []
     rig.mag_chip.stick(PDCNTL)
     assert rig.until(MAG_FRESH) < 500_000
-    assert (
-        rig.mag.resets == 2
-    )  # found wrong, written, found wrong again; however often it was written
+    assert rig.mag.resets == 1  # however often it was written
 
 
 def test_one_missing_acknowledge_costs_one_measurement_at_the_most(rig):
-    rig.mag.configure()
+    rig.configure()
     rig.until(MAG_FRESH)
     for after in range(0, 90, 3):
         rig.mag_chip.nack_next(1, after)
-        assert gaps(rig.run(60)) <= {9, 10, 11, 19, 20, 21}
+        # a start that was lost is given again when the measurement is overdue: 13 samples and one measurement
+        assert max(gaps(rig.run(60))) <= (24 if rig.mag.own_bus else 21)
     assert rig.mag.resets == 0
 
 
 def test_one_look_at_a_register_that_fails_costs_nothing(rig, monkeypatch):
-    rig.mag.configure()
+    rig.configure()
     rig.until(MAG_FRESH)
     write = rig.mag_chip.i2c_write
     refused = []
@@ -503,7 +586,7 @@ def test_one_look_at_a_register_that_fails_costs_nothing(rig, monkeypatch):
 
 @pytest.mark.parametrize("seed", range(2))
 def test_a_storm_of_missing_acknowledges_costs_measurements_and_nothing_else(rig, seed):
-    rig.mag.configure()
+    rig.configure()
     rig.until(MAG_FRESH)
     state = seed + 1
     for _ in range(1000):
@@ -524,10 +607,10 @@ def test_a_storm_of_missing_acknowledges_costs_measurements_and_nothing_else(rig
 def test_health_costs_two_accesses_at_the_most(rig, monkeypatch):
     rig.mag_chip.vanish()
     with pytest.raises(IST8310Error):
-        rig.mag.configure()
+        rig.configure()
     rig.mag.attach()
     accesses = []
-    bus = rig.imu.registers
+    bus = rig.mag._registers if rig.mag.own_bus else rig.imu.registers
     read, write = bus.read_into, bus.write
     monkeypatch.setattr(bus, "read_into", lambda r, b: accesses.append(r) or read(r, b))
     monkeypatch.setattr(bus, "write", lambda r, v: accesses.append(r) or write(r, v))
@@ -537,77 +620,32 @@ def test_health_costs_two_accesses_at_the_most(rig, monkeypatch):
         kernel.advance(1000)
         accesses.clear()
         rig.mag.health()
-        assert len(accesses) <= 2
+        assert 1 <= len(accesses) <= 2
     assert rig.mag.present
 
 
-def test_configure_again_with_another_rate(rig):
-    rig.mag.configure(rate_hz=100)
-    rig.run(50)
-    rig.mag.configure(rate_hz=50)
-    rig.until(MAG_FRESH)
-    assert gaps(rig.run(400)) == {20}
-    rig.imu.configure(sample_rate_hz=1000)
-    assert rig.run(50) == []
-    rig.mag.configure()
-    rig.until(MAG_FRESH)
-    assert gaps(rig.run(300)) == {10}
-    assert rig.imu.resets == 0
-    assert rig.chip.misuse == []
+def test_configure_again_with_another_rate(behind):
+    behind.configure(rate_hz=100)
+    behind.run(50)
+    behind.configure(rate_hz=50)
+    behind.until(MAG_FRESH)
+    assert gaps(behind.run(400)) == {20}
+    behind.imu.configure(sample_rate_hz=1000)
+    assert behind.run(50) == []
+    behind.configure()
+    behind.until(MAG_FRESH)
+    assert gaps(behind.run(300)) == {10}
+    assert behind.imu.resets == 0
+    assert behind.chip.misuse == []
 
 
-# Directly on a bus
+# On a bus of its own
 
 
-class Direct:
-    """An IST8310 on I2C 1, read at rate Hz."""
-
-    def __init__(self, rate=200, world=None):
-        self.world = world or StillWorld((0, 0, 4096, 0, 0, 0, *FIELD))
-        self.chip = IST8310Chip(self.world)
-        self.bus = machine.wire_i2c(1, self.chip)
-        self.mag = IST8310_I2C(machine.I2C(1, freq=400_000))
-        self.counts = array("h", bytes(22))
-        self.rate = rate
-        self.period = 1_000_000 // rate
-
-    def configure(self, **arguments):
-        self.mag.configure(sample_rate=self.rate, **arguments)
-
-    def tick(self):
-        kernel.advance(self.period - kernel.now() % self.period)
-        self.counts[10] = FRESH
-        flags = self.mag.read(self.counts)
-        assert flags == self.counts[10] and flags & FRESH
-        return flags
-
-    def run(self, n):
-        return [i for i in range(n) if self.tick() & MAG_FRESH]
-
-    def until(self, most=1000):
-        start = kernel.now()
-        for _ in range(most):
-            if self.tick() & MAG_FRESH:
-                return kernel.now() - start
-        raise AssertionError("no measurement")
-
-
-@pytest.mark.parametrize("rate, n", [(1000, 10), (500, 5), (200, 2), (100, 2)])
-def test_on_a_bus_every_measurement_is_delivered_once(rate, n):
-    rig = Direct(rate)
+def test_on_a_bus_of_its_own_it_is_left_alone_while_it_measures():
+    rig = Rig("own bus")
     rig.configure()
-    rig.until()
-    assert gaps(rig.run(300)) == {n}
-    assert tuple(rig.counts[6:9]) == FIELD
-    assert (rig.mag.stale, rig.mag.errors, rig.mag.resets) == (0, 0, 0)
-    assert rig.mag.sample_rate == (rate // n, 1)
-    assert rig.chip.misuse == []
-
-
-def test_on_a_bus_it_is_left_alone_while_it_measures():
-    rig = Direct(1000)
-    rig.configure()
-    rig.until()
+    rig.until(MAG_FRESH)
     busy = []
     for _ in range(10):
         before = rig.bus.bytes
@@ -617,73 +655,13 @@ def test_on_a_bus_it_is_left_alone_while_it_measures():
     assert max(busy) <= 16
 
 
-def test_on_a_bus_an_absent_one_is_named_and_found_later():
-    rig = Direct()
-    rig.chip.vanish()
-    with pytest.raises(IST8310Error, match=r"no IST8310 at 0x0e \("):
-        rig.configure()
-    rig.mag.attach()
-    assert rig.run(300) == []
-    assert rig.mag.errors > 50 and not rig.mag.present
-    rig.chip.come_back()
-    assert rig.until() < 500_000
-    assert rig.mag.resets == 1
-    assert rig.chip.register(AVGCNTL) == 0x24 and rig.chip.register(PDCNTL) == 0xC0
-    assert gaps(rig.run(200)) == {2}
-
-
-def test_on_a_bus_vanishing_and_coming_back():
-    rig = Direct()
+def test_on_a_bus_of_its_own_a_trigger_that_was_lost_is_given_again():
+    rig = Rig("own bus")
     rig.configure()
-    rig.until()
-    rig.chip.vanish()
-    assert rig.run(200) == []
-    assert rig.mag.stale > 30
-    rig.chip.come_back()
-    assert rig.until() < 500_000
-    assert rig.mag.resets == 0
-    assert gaps(rig.run(200)) == {2}
-
-
-@pytest.mark.parametrize("rate", [1000, 200])
-def test_on_a_bus_a_reset_is_noticed_and_mended(rate):
-    rig = Direct(rate)
-    rig.configure()
-    rig.until()
-    rig.chip.brown_out(kernel.now())
-    rig.tick()
-    assert rig.until() < 500_000
-    rig.run(rate)
-    assert rig.mag.resets == 1
-    assert rig.chip.register(AVGCNTL) == 0x24 and rig.chip.register(PDCNTL) == 0xC0
-    assert gaps(rig.run(100)) == {rate // 100}
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_on_a_bus_a_storm_of_missing_acknowledges(seed):
-    rig = Direct()
-    rig.configure()
-    rig.until()
-    state = seed + 1
-    for _ in range(2000):
-        state = state * 1103515245 + 12345 & 0x7FFFFFFF
-        if state >> 16 & 3 == 0:
-            rig.chip.nack_next(1 + (state >> 20 & 7), after=state >> 24 & 3)
-        rig.tick()
-    rig.chip.nack_next(0)
-    assert rig.mag.errors > 100
-    assert rig.until() < 500_000
-    rig.run(50)
-    assert gaps(rig.run(200)) == {2}
-
-
-def test_on_a_bus_a_trigger_that_was_lost_is_given_again():
-    rig = Direct(1000)
-    rig.configure()
-    rig.until()
-    rig.chip.poke(CNTL1, 0)  # stops a measurement under way
+    rig.until(MAG_FRESH)
+    rig.mag_chip.poke(CNTL1, 0)  # stops a measurement under way
     rig.run(5)
-    rig.chip.poke(CNTL1, 0)
+    rig.mag_chip.poke(CNTL1, 0)
     assert rig.run(40)
     assert rig.mag.stale <= 1
 

@@ -48,7 +48,7 @@ class Source:
             except OSError as why:
                 self.mag = None
                 self.mag_fault = str(why)
-        self._own_mag = self.mag if hasattr(self.mag, "read") else None
+        self._own_mag = self.mag if self.mag is not None and self.mag.own_bus else None
         self.counts = imu.counts
         num, den = imu.sample_rate
         self._early_us = 800000 * den // num  # so long after a sample there cannot be another

@@ -89,7 +89,7 @@ class _Recorder:
             passed = time.ticks_diff(now, last)
             if flags & 1:
                 # one that is read by itself has its sample with one of the IMU's
-                if mag is not None and hasattr(mag, "read"):
+                if mag is not None and mag.own_bus:
                     mag.read(counts)
                 missed = (passed + period // 2) // period - 1 if self.n else 0
                 while missed > 0 and self.n < self._rows - 1:

@@ -10,8 +10,8 @@ from array import array
 sys.path.append(__file__.rsplit("/", 1)[0] if "/" in __file__ else ".")
 
 from allocation import borrowed, grown, locked
-from upright.auxiliary_bus import AUX_BUSY, AUX_DONE, AUX_NACK, AUX_TIMEOUT, AuxiliaryBus
-from upright.ist8310 import IST8310, IST8310_I2C
+from upright.auxiliary_bus import AUX_BUSY, AuxiliaryBus
+from upright.ist8310 import IST8310
 from upright.mpu6050 import MPU6050
 
 TICKS = 2_000
@@ -120,7 +120,8 @@ class Ticks:
         self.aux = AuxiliaryBus(self.imu)
         self.mag = IST8310(self.aux)
         self.mag.configure()
-        self.direct = IST8310_I2C(self.bus)
+        self.device = self.aux.device(MAG)
+        self.direct = IST8310(self.bus)
         self.direct.configure(sample_rate=1000)
         self.counts = array("h", bytes(22))
         self.busy = 0
@@ -158,16 +159,13 @@ class Ticks:
 
     def transactions(self, i):
         self.disturb(i)
-        state = self.aux.poll()
-        if state == AUX_BUSY:
-            return
-        if state == AUX_DONE or state == AUX_NACK or state == AUX_TIMEOUT:
-            self.busy += 1
-        self.aux.faults = 0
-        if i & 1:
-            self.aux.post_read(MAG, 0x41)
+        if self.done & 1:
+            outcome = self.device.transact(0x41, -1)
         else:
-            self.aux.post_write(MAG, 0x41, 0x24)
+            outcome = self.device.transact(0x41, 0x24)
+        if outcome != AUX_BUSY:
+            self.done += 1
+            self.busy += 1
 
     # A twin that must be found out
 

@@ -310,7 +310,7 @@ class AHRS:
             return
         sensor, settings = self.sensor, self.settings
         self.magnetometer = mag = mag(sensor) if callable(mag) else mag
-        self._own_mag = mag if hasattr(mag, "read") else None
+        self._own_mag = mag if mag.own_bus else None
         rate = settings.RATE if settings.EXTERNAL_CLOCK else sensor.sample_rate
         if self._own_mag is None and self.drive == "timer" and rate != settings.RATE:
             raise ValueError(

@@ -20,7 +20,7 @@ from upright_host import __version__, paths, runtimes
 # chip, and the registry of the filters imports the default by its name.
 _TOGETHER = {
     "mpu6500": ("ist8310",),
-    "ist8310": ("mpu6500",),
+    "ist8310": ("auxiliary_bus",),
     "dmp": ("mpu6050",),
     "filters": ("inertial",),
 }

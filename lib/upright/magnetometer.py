@@ -1,0 +1,437 @@
+# What the drivers of magnetometers share: one chip behind an IMU's auxiliary bus or on a bus of its own, its rate, and
+# the watch over its registers. Needs registers.py, and auxiliary_bus.py for a chip behind an IMU. Runs on
+# MicroPython >= 1.22 and under CPython with a `micropython` shim. A driver is a subclass, as in ist8310.py.
+
+import time
+from array import array
+
+import micropython
+from micropython import const
+
+from upright.registers import I2CRegisters
+
+_MAG_FRESH = const(2)
+_COUNT_MASK = const(0x3FFFFFFF)
+
+_BUSY = const(-1)  # what transact() answers, as in auxiliary_bus.py
+_NACK = const(-2)
+
+# Words of the state. The subclass's take() keeps those from _FRESH to _Z.
+_FRESH = const(0)
+_STALE = const(1)
+_SATURATED = const(2)
+_UNFLAGGED = const(3)
+_STEP = const(4)
+_LEFT = const(5)  # samples until the next measurement is overdue
+_LIMIT = const(6)
+_N = const(7)  # samples from one measurement to the next
+_WAS_READY = const(8)  # the status said so with the sample before
+_X = const(9)  # the newest measurement
+# and those of read():
+_DUE = const(12)  # calls after which a measurement may be through; 0 behind an IMU
+_AGE = const(13)  # calls since the last one was started
+_WAITING = const(14)  # 1: it has not come yet
+_WORDS = const(15)
+
+# _STEP: what the look at a register is for. Only in _WATCH measurements are delivered.
+_ABSENT = const(0)  # does it answer?
+_CHECK = const(1)  # it has answered: does it still have its registers?
+_REPAIR = const(2)  # a register was wrong: read each again
+_WRITE = const(3)  # and this one is being written
+_WATCH = const(4)  # all are as they should be
+
+_MARGIN_PERCENT = const(2)  # both chips' clocks
+
+
+class OwnBus:
+    """A magnetometer's registers on a bus of the microcontroller, with the methods of AuxiliaryDevice that a
+    Magnetometer uses."""
+
+    own_bus = True
+    where = ""
+    sample_rate = 1000
+
+    def __init__(self, registers):
+        self._registers = registers
+        self._byte = bytearray(1)
+        self.errors = 0
+
+    def begin(self):
+        pass
+
+    def attach(self, *what):
+        pass
+
+    # The tick
+
+    @micropython.native
+    def transact(self, register, data):
+        if data < 0:
+            return self._byte[0] if self.fetch(register, self._byte) else _NACK
+        try:
+            self._registers.write(register, data)
+            return 0
+        except OSError:
+            self._fault()
+            return _NACK
+
+    @micropython.native
+    def fetch(self, register, buffer):
+        """1, or 0 when the bus failed."""
+        try:
+            self._registers.read_into(register, buffer)
+            return 1
+        except OSError:
+            self._fault()
+            return 0
+
+    def _fault(self):
+        self.errors = (self.errors + 1) & _COUNT_MASK
+
+
+class Magnetometer:
+    """The driver of one chip without what is that chip's own.
+
+    bus      AuxiliaryBus of a configured IMU, which then gives all of its slots; or an I2C bus (has
+             readfrom_mem_into and writeto), or the chip's I2CRegisters
+    address  on that bus
+
+    own_bus says which: False: imu.read() or imu.fifo_next() fills counts[6..8] and sets bit 1 of the flags with each
+    new measurement, and imu.health() looks after the chip. True: read() does both and is to be called once a sample.
+    The frame is the chip's own.
+
+    Counters, wrapping at 2**30: fresh, stale, saturated, unflagged, errors (behind an IMU: looks that found a missing
+    acknowledge; else faults of the bus), resets (times that its registers had to be written). present: it answered
+    when last asked.
+
+    A subclass brings
+
+        chip, error_class   the name, and the class of its exceptions, an OSError
+        lsb_per_uT          (num, den)
+        AVERAGES            {readings to a measurement: least us from one measurement to the next}
+        SAMPLE              (register, length) of status and data
+        START               (register, value) that starts a measurement
+        RESET               (register, bit) of the soft reset; the bit clears itself
+        RESET_MS            the longest time until it answers after that, or after power-on
+        HINT                what to check when nothing answers
+        registers_for(average)   rows (register, value, mask) that make up its configuration; the first is its
+                                 identity, which the reset brings back
+        take(raw, at, counts)    unpack the bytes of SAMPLE at raw[at]; returns 2 for a new measurement, else 0
+    """
+
+    def __init__(self, bus, address):
+        if hasattr(bus, "device"):
+            self._registers = self._link = bus.device(address)
+        else:
+            if hasattr(bus, "readfrom_mem_into"):
+                bus = I2CRegisters(bus, address)
+            elif not hasattr(bus, "read_into"):
+                raise TypeError(f"{bus!r} is neither an AuxiliaryBus nor an I2C bus")
+            self._registers = bus
+            self._link = OwnBus(bus)
+        self.own_bus = self._link.own_bus
+        self._transact = self._link.transact  # fetching a bound method allocates
+        if self.own_bus:
+            self._fetch = self._link.fetch
+        self._registers.error_class = self.error_class
+        self._registers.name = self._name
+        self._state = array("i", [0] * _WORDS)
+        self._kept = bytearray(
+            12
+        )  # for take(): the data that were used last, and those of the sample before
+        self._set_rows(max(self.AVERAGES))
+        self._start, self._start_value = self.START
+        self._sample, length = self.SAMPLE
+        self._raw = bytearray(length)
+        self.resets = 0
+        self.sample_rate = None
+        self._row = 0
+        self._unseen = 0  # rows that have yet to be seen right
+        self._misses = 0
+
+    # Set-up: may wait, allocate and raise
+
+    def configure(self, rate_hz=100, average=None, sample_rate=None):
+        """Find the magnetometer, reset and configure it, and let it measure.
+
+        rate_hz      measurements per second at the most, int or (num, den)
+        average      readings to a measurement, one of AVERAGES; None: the most
+        sample_rate  how often it is read, int Hz or (num, den); None: the IMU's sample rate (without an
+                     IMU 1000 Hz)
+
+        A measurement falls on every n-th sample, n being 2 to 32; afterwards sample_rate is what this gives,
+        (num, den) Hz.
+
+        Raises ValueError for a rate that the chip, or n, cannot do, and error_class when the chip is
+        absent or does not keep what is written to it. After that attach() is worth while all the same:
+        a magnetometer that turns up later is found and configured in the tick.
+        """
+        self._plan(rate_hz, average, sample_rate)
+        self.begin()
+        self.attach()
+        self._state[_STEP] = _WATCH
+
+    def begin(self):
+        """Find the chip, reset it, write its registers and read them back."""
+        self._state[_STEP] = _ABSENT
+        self._link.begin()
+        identity, right, _ = self._rows[0]
+        who = self._await(identity)
+        if who != right:
+            # it can be written, and so be spoilt by noise, even across a short loss of supply; a soft reset
+            # mends it (seen by ArduPilot)
+            try:
+                self._reset()
+            except OSError:
+                pass  # of another chip
+            who = self._await(identity)
+        if who == right:
+            stuck = self._reset()
+            who = self._await(identity)
+        if who != right:
+            raise self.error_class(
+                f"0x{self._registers.address:02x}{self._link.where} answers register 0x{identity:02x} with "
+                f"0x{who:02x}, and the identity of the {self.chip} is 0x{right:02x}: it is another chip"
+            )
+        if stuck:
+            raise self.error_class(
+                f"the {self.chip} did not come out of reset in {self.RESET_MS} ms"
+            )
+        for register, value, mask in self._rows[1:]:
+            self._registers.write_register(register, value)
+            self._registers.verify_register(register, value, mask)
+
+    def attach(self):
+        """Let the tick read it, and look for it where configure() did not find it."""
+        if self.sample_rate is None:
+            self._plan(100, None, None)
+        state = self._state
+        state[_STEP] = _ABSENT
+        state[_WAS_READY] = 0
+        state[_LEFT] = state[_LIMIT]
+        for i in range(len(self._kept)):
+            self._kept[i] = 0
+        self._row = self._misses = 0
+        state[_WAITING] = 0
+        state[_AGE] = state[_N]
+        sample, length = self.SAMPLE
+        trigger, value = self.START
+        self._link.attach(self, sample, length, trigger, value, state[_N])
+
+    def _plan(self, rate_hz, average, sample_rate):
+        if average is None:
+            average = max(self.AVERAGES)
+        if average not in self.AVERAGES:
+            choice = ", ".join(str(a) for a in sorted(self.AVERAGES))
+            raise ValueError(f"average {average!r} is not one of {choice}")
+        num, den = _ratio(
+            "sample_rate", self._link.sample_rate if sample_rate is None else sample_rate
+        )
+        rate_num, rate_den = _ratio("rate_hz", rate_hz)
+        # At least 2, for DRDY shows a new measurement by going away in between
+        n = max(2, -(-num * rate_den // (den * rate_num)))
+        least = self.AVERAGES[average] * (100 + _MARGIN_PERCENT)  # us, times 100
+        if n * den * 100_000_000 < least * num:
+            n = -(-least * num // (den * 100_000_000))
+            most = f"at most {num}/{den * n} Hz" if n <= 32 else "no rate at all"
+            raise ValueError(
+                f"rate_hz {rate_hz!r}: with an average of {average} and {num}/{den} samples per second the "
+                f"{self.chip} can do {most}"
+            )
+        if n > 32:
+            raise ValueError(
+                f"rate_hz {rate_hz!r}: the least is a 32nd of {num}/{den} samples per second"
+            )
+        self._set_rows(average)
+        state = self._state
+        state[_N] = n
+        state[_LIMIT] = n + 3
+        state[_DUE] = 0
+        if self.own_bus:
+            state[_LIMIT] = _COUNT_MASK  # read() itself knows when one is overdue
+            state[_DUE] = min(n, max(1, least * num // (100_000_000 * den)))
+        self.sample_rate = _ratio("", (num, den * n))
+
+    def _set_rows(self, average):
+        rows = self._rows = self.registers_for(average)
+        self._numbers = bytes(row[0] for row in rows)
+        self._values = bytes(row[1] for row in rows)
+        self._masks = bytes(row[2] for row in rows)
+        # what is written to mend a row; the identity by a reset
+        self._mend_numbers = bytes(self.RESET[:1]) + self._numbers[1:]
+        self._mend_values = bytes(self.RESET[1:]) + self._values[1:]
+
+    def _reset(self):
+        """Soft reset, waited for by its own bit; returns the bit."""
+        register, bit = self.RESET
+        self._registers.write_register(register, bit)
+        return self._await(register, bit) & bit
+
+    def _await(self, register, busy=0):
+        """Read a register until it answers and its busy bits are clear, RESET_MS at the most."""
+        byte = bytearray(1)
+        start = time.ticks_ms()
+        while True:
+            late = time.ticks_diff(time.ticks_ms(), start) > self.RESET_MS
+            try:
+                self._registers.read_into(register, byte)
+                if not byte[0] & busy or late:
+                    return byte[0]
+            except OSError as e:
+                why = e
+                if late:
+                    break
+            time.sleep_ms(1)
+        raise self.error_class(
+            f"no {self.chip} at 0x{self._registers.address:02x}{self._link.where} ({why}). {self.HINT}"
+        )
+
+    def _name(self, register):
+        return f"register 0x{register:02x} of the {self.chip}"
+
+    # For programs
+
+    def field(self):
+        """The newest measurement in uT: (x, y, z), in the chip's frame; None before the first."""
+        num, den = self.lsb_per_uT
+        state = self._state
+        before = None
+        while before != state[_FRESH]:  # a tick may come in between
+            before = state[_FRESH]
+            x, y, z = state[_X], state[_X + 1], state[_X + 2]
+        return (x * den / num, y * den / num, z * den / num) if before else None
+
+    @property
+    def present(self):
+        """It answered when last asked."""
+        return self._state[_STEP] != _ABSENT
+
+    @property
+    def errors(self):
+        """Behind an IMU: looks that found a missing acknowledge. On a bus of its own: faults of the bus."""
+        return self._link.errors
+
+    @property
+    def fresh(self):
+        """Measurements that were delivered."""
+        return self._state[_FRESH]
+
+    @property
+    def stale(self):
+        """Times that a measurement was overdue: more than two samples late, then once for each missing."""
+        return self._state[_STALE]
+
+    @property
+    def saturated(self):
+        """Measurements that were withheld, an axis being beyond its range."""
+        return self._state[_SATURATED]
+
+    @property
+    def unflagged(self):
+        """Measurements that were recognised by their data, the chip's own flag having gone by unseen."""
+        return self._state[_UNFLAGGED]
+
+    # The tick: nothing below allocates, waits, raises or uses a float.
+
+    @micropython.native
+    def read(self, counts):
+        """On a bus of its own, to be called once a sample: fills counts[6..8] and sets bit 1 of counts[10] with each
+        new measurement; returns counts[10]. Behind an IMU, whose samples bring that, it does nothing.
+
+        At most two transfers a call: status and data once the measurement may be through, the start of the
+        next, and in between one register of the configuration.
+        """
+        flags = counts[10]
+        state = self._state
+        due = state[_DUE]
+        if not due:
+            return flags
+        flags &= ~_MAG_FRESH
+        age = state[_AGE] + 1
+        state[_AGE] = age
+        waiting = state[_WAITING]
+        if waiting and age >= due and state[_STEP]:
+            raw = self._raw
+            if self._fetch(self._sample, raw):
+                flags |= self.take(raw, 0, counts)
+                waiting = 1 - state[_WAS_READY]
+                state[_WAITING] = waiting
+        n = state[_N]
+        if age >= n and (not waiting or age > n + 2):
+            if waiting:
+                state[_STALE] = (state[_STALE] + 1) & _COUNT_MASK
+            state[_LEFT] = _COUNT_MASK
+            state[_WAS_READY] = 0
+            state[_WAITING] = 1
+            state[_AGE] = 0
+            if state[_STEP]:
+                self._transact(self._start, self._start_value)
+        elif age == 1:
+            self.health()
+        counts[10] = flags
+        return flags
+
+    @micropython.native
+    def health(self):
+        """Look after the chip's registers; returns present.
+
+        Each is read in turn and written when it is not as it should be, then read again; after that no measurement
+        is delivered until all have been seen right. Behind an IMU at most two of the IMU's registers a call.
+        """
+        state = self._state
+        row = self._row
+        writing = state[_STEP] == _WRITE
+        if writing:
+            outcome = self._transact(self._mend_numbers[row], self._mend_values[row])
+        else:
+            outcome = self._transact(self._numbers[row], -1)
+        if outcome >= 0:
+            self._misses = 0
+            if writing:
+                state[_STEP] = _REPAIR
+            else:
+                self._judge(outcome)
+        elif outcome != _BUSY:
+            self._missed()
+        return state[_STEP] != _ABSENT
+
+    @micropython.native
+    def _judge(self, value):
+        """The register of this row was read: go on to the next, or have it written."""
+        state = self._state
+        step = state[_STEP]
+        row = self._row
+        rows = len(self._numbers)
+        wrong = (value ^ self._values[row]) & self._masks[row]
+        if step == _ABSENT or step == _WATCH or (wrong and not row):
+            self._unseen = rows
+        if wrong:
+            if step != _REPAIR:
+                self.resets = (self.resets + 1) & _COUNT_MASK
+            state[_STEP] = _WRITE
+            return
+        self._row = row + 1 if row + 1 < rows else 0
+        self._unseen -= 1
+        if step == _ABSENT:
+            state[_STEP] = _CHECK
+        elif not self._unseen:
+            state[_STEP] = _WATCH
+
+    @micropython.native
+    def _missed(self):
+        """No answer: tried again, but two in a row mean that it is gone, to be looked for from the beginning."""
+        self._misses += 1
+        if self._misses > 1:
+            self._misses = self._row = 0
+            self._state[_STEP] = _ABSENT
+
+
+def _ratio(name, rate):
+    """(num, den) of an int or (num, den), reduced."""
+    num, den = rate if isinstance(rate, (tuple, list)) else (rate, 1)
+    if not isinstance(num, int) or not isinstance(den, int) or num <= 0 or den <= 0:
+        raise ValueError(f"{name} {rate!r} is neither a positive int nor (num, den)")
+    a, b = num, den
+    while b:
+        a, b = b, a % b
+    return num // a, den // a
