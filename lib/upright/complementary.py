@@ -9,31 +9,30 @@ from micropython import const
 
 from upright import fixmath
 from upright.attitude import Attitude, bias_of, hertz
-from upright.euler_kernels import compose, direction, lean, sines
+from upright.euler_kernels import accel_angles, compose, direction, sines
 
-# the words of the kernels that are used here ...
-_PROBE = const(0)
-_Q = const(1)
-_A = const(5)
-_AR = const(8)
-_X = const(11)
-_S = const(14)
-_C = const(17)
-_Z = const(20)
-_LOW = const(22)
-# ... and the filter's own
+# -- words of the state: written by tools/upright_host/words.py
+_PROBE = const(0)  # always -1, see fixmath.py
+_A = const(5)  # 3: roll, pitch, yaw in the order zyx; pitch within +-2**28
+_AR = const(8)  # 3: their last 15 bits, 0..32767
+_X = const(11)  # 3: angles for sines(), any within +-2**30
+_S = const(14)  # 3, Q29: their sines
+_C = const(17)  # 3, Q29: their cosines
+_Z = const(20)  # 2: roll and pitch that the accelerometer shows
+_LOW = const(22)  # least squared length / 4 of the accelerometer's counts that is used
 _D = const(23)  # 2: what roll and pitch turned by in the last step
 _E = const(25)  # 2: roll and pitch error of this step: accelerometer less gyro
 _K = const(27)  # the part of the error that is taken up: K / 2**(K_SHIFT + 14)
 _K_SHIFT = const(28)  # 0..16
-_G = const(29)  # angle per step of one gyro count ...
-_GR = const(30)  # ... and its last 15 bits, 0..32767
+_G = const(29)  # angle per step of one gyro count
+_GR = const(30)  # its last 15 bits, 0..32767
 _WR = const(31)  # 3: what rounding left of the gyro's angles, 15 bits
 _B = const(34)  # 3: gyro bias that is set, angle per step
 _BR = const(37)  # 3: its last 15 bits, 0..32767
 _O = const(40)  # 3: what is added to the gyro: less the bias, set and learnt
 _OR = const(43)  # 3: its last 15 bits, -65534..0
-OWN = const(46)  # a subclass' words follow
+_WORDS = const(46)
+# -- end of the words
 
 _STEP_MAX = const((1 << 30) // 6)  # no axis turns by more than 60 deg in a step
 _LEAST_MANTISSA = const(64)  # a gain is held to better than 1 %
@@ -77,20 +76,18 @@ class Euler6(Attitude):
     NAME = "euler6"
     AXES = 6
 
-    _size = OWN  # words of the state
-
     def __init__(self, rate, gyro_scale, accel_lsb_per_g, tau=8):
-        self._set_up(rate, gyro_scale, accel_lsb_per_g)
+        self.prepare(rate, gyro_scale, accel_lsb_per_g, _WORDS)
         if tau is not None:
             self._set_tau(tau)
 
-    def _set_up(self, rate, gyro_scale, accel_lsb_per_g, bias_limit_dps=0):
+    def prepare(self, rate, gyro_scale, accel_lsb_per_g, words, bias_limit_dps=0):
         """All but the gains. Room is left for a bias that is learnt, up to the limit -> that in 2**-45 turn a step."""
         limit = fixmath.quantise(bias_limit_dps, "bias_limit_dps")
         if limit > 250000000:
             raise ValueError("bias_limit_dps is %r, expected 0..250 deg/s" % (bias_limit_dps,))
-        s = self._begin(rate, gyro_scale, accel_lsb_per_g, self._size)
-        self._bias = array("i", [0, 0, 0])  # 1/256 counts
+        Attitude.__init__(self, rate, gyro_scale, accel_lsb_per_g, words)
+        s = self.state
         s[_LOW] = accel_lsb_per_g * accel_lsb_per_g >> 10  # (1/16 g)**2 / 4
         num, den = self.rate
         scale_num, scale_den = self.gyro_scale
@@ -132,8 +129,8 @@ class Euler6(Attitude):
                     hertz(self.rate),
                 )
             )
-        self._s[_K] = pair[0]
-        self._s[_K_SHIFT] = pair[1] - 14
+        self.state[_K] = pair[0]
+        self.state[_K_SHIFT] = pair[1] - 14
 
     # -- set-up and main loop
     def seed(self, counts):
@@ -143,18 +140,15 @@ class Euler6(Attitude):
         is to be given the same sample next.
         """
         sample = array("h", [counts[0], counts[1], counts[2], 0, 0, 0, 0, 0, 0, 0, 1])
-        if not lean(self._s, sample):
+        if not accel_angles(self.state, sample):
             self._place(0, 0, 0)
             return False
-        self._place(self._s[_Z], self._s[_Z + 1], 0)
+        self._place(self.state[_Z], self.state[_Z + 1], 0)
         return True
 
-    def set_quaternion(self, w, x, y, z):
-        """Set the attitude outright: any 4 ints or floats; they need not be normalised.
-
-        Raises ValueError when all are 0 or one is not finite. Closer than 2e-4 deg to pitch = +-90 deg roll becomes 0.
-        """
-        w, x, y, z = fixmath.unit_quaternion(w, x, y, z)
+    def start_at(self, q):
+        """Closer than 2e-4 deg to pitch = +-90 deg roll becomes 0."""
+        w, x, y, z = q
         up_x, up_y = 2 * (x * z - w * y), 2 * (y * z + w * x)
         up_z = w * w - x * x - y * y + z * z
         side = fixmath.isqrt(up_y * up_y + up_z * up_z)
@@ -168,7 +162,7 @@ class Euler6(Attitude):
         self._place(roll, pitch, yaw)
 
     def _place(self, *angles):
-        s = self._s
+        s = self.state
         for i in range(3):
             s[_A + i] = ((angles[i] + (1 << 29)) & 0x3FFFFFFF) - (1 << 29)
             s[_X + i] = s[_A + i] >> 1
@@ -178,44 +172,24 @@ class Euler6(Attitude):
         sines(s, 3)
         compose(s)
 
-    def set_bias(self, x, y, z):
+    def set_bias(self, x, y, z, known_s=0):
         """Set the gyro's bias, ints in 1/256 of a gyro count; it is subtracted from every sample.
 
-        Raises ValueError beyond +-8192 counts.
+        known_s, how well the bias is known, changes nothing here. Raises ValueError beyond +-8192 counts, and for a
+        known_s that is none.
         """
-        bias = bias_of(x, y, z)
-        s = self._s
+        bias = bias_of(x, y, z, known_s)
+        s = self.state
         gain = (s[_G] << 15) + s[_GR]
         for i in range(3):
-            self._bias[i] = bias[i]
+            self.bias_set[i] = bias[i]
             b = fixmath.ratio(bias[i] * gain, 256)
             s[_B + i] = b >> 15
             s[_BR + i] = b & 32767
             s[_O + i] = -s[_B + i]
             s[_OR + i] = -s[_BR + i]
 
-    def bias(self, out):
-        """The gyro's bias in 1/256 of a gyro count: out[0..2]."""
-        for i in range(3):
-            out[i] = self._bias[i]
-
-    def bias_mdps(self, out):
-        """The gyro's bias in millidegrees/s: out[0..2]. For the main loop: it may allocate."""
-        num, den = self.gyro_scale
-        for i in range(3):
-            out[i] = fixmath.ratio(self._bias[i] * 1000 * den, 256 * num)
-
     # -- tick
-    def angles(self, out, order="zyx"):
-        """Roll, pitch, yaw of the attitude in integer millidegrees: see fixmath.euler.
-
-        By way of the quaternion, as with every filter, so that both orders, a display's copy of the quaternion and this
-        agree to the bit; it costs less than a millidegree. Near pitch = +-90 deg roll is therefore 0.
-
-        Where a tick may cut in, convert a copy of the quaternion: fixmath.euler(copy, out, order).
-        """
-        fixmath.euler(self._q, out, order)
-
     @micropython.viper
     def update(self, counts):
         """One step of 1/rate with the sample counts: array('h') of 11 words.
@@ -223,7 +197,7 @@ class Euler6(Attitude):
         The accelerometer is left out when flags (word 10) has bit 0 clear (no fresh sample: the last gyro words go on)
         or bit 2 set (accelerometer at full scale), and below 1/16 g.
         """
-        step(self._s, counts)
+        step(self.state, counts)
 
 
 @micropython.viper
@@ -329,7 +303,7 @@ def step(state, counts) -> int:
         yaw += 0x20000000
         s[_D + 1] = 0 - (s[_D + 1] << k >> k)
     roll = ((roll + 0x20000000) & 0x3FFFFFFF) - 0x20000000
-    used = int(lean(state, counts))
+    used = int(accel_angles(state, counts))
     if used:
         g = s[_K]
         shift = s[_K_SHIFT]

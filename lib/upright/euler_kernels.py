@@ -8,16 +8,15 @@
 import micropython
 from micropython import const
 
-PROBE = const(0)  # always -1
-Q = const(1)  # 4 words: quaternion w x y z, body to earth, Q29
-A = const(5)  # 3: roll, pitch, yaw in the order zyx; pitch within +-2**28
-AR = const(8)  # 3: their last 15 bits, 0..32767
-X = const(11)  # 3: angles for sines(), any within +-2**30
-S = const(14)  # 3: their sines, Q29
-C = const(17)  # 3: their cosines, Q29
-Z = const(20)  # 2: roll and pitch that the accelerometer shows
-LOW = const(22)  # least squared length / 4 of the accelerometer's counts that is used
-OWN = const(23)  # the filter's own words follow
+# -- words of the state: written by tools/upright_host/words.py
+_PROBE = const(0)  # always -1, see fixmath.py
+_Q = const(1)  # 4, Q29: quaternion w x y z, body to earth
+_X = const(11)  # 3: angles for sines(), any within +-2**30
+_S = const(14)  # 3, Q29: their sines
+_C = const(17)  # 3, Q29: their cosines
+_Z = const(20)  # 2: roll and pitch that the accelerometer shows
+_LOW = const(22)  # least squared length / 4 of the accelerometer's counts that is used
+# -- end of the words
 
 
 @micropython.viper
@@ -28,11 +27,11 @@ def sines(s: ptr32, n: int):
     their integer coefficients fitted near those of the series (1.2e-9, 5e-11).
     """
     k = 0
-    if s[PROBE] > 0:
+    if s[_PROBE] > 0:
         k = 32
     i = 0
     while i < n:
-        x = s[X + i] << k >> k
+        x = s[_X + i] << k >> k
         quarter = (x + 0x8000000) >> 28
         x = (x - (quarter << 28)) << 2  # z, Q29
         xh = (x + 8192) >> 14
@@ -69,8 +68,8 @@ def sines(s: ptr32, n: int):
         if quarter & 2:
             x = 0 - x
             y = 0 - y
-        s[S + i] = y
-        s[C + i] = x
+        s[_S + i] = y
+        s[_C + i] = x
         i += 1
 
 
@@ -134,7 +133,7 @@ def direction(y: int, x: int) -> int:
 
 
 @micropython.viper
-def lean(state, counts) -> int:
+def accel_angles(state, counts) -> int:
     """Put the roll and pitch that the accelerometer shows into Z: atan2(ay, az), atan2(-ax, hypot(ay, az)) -> 1.
 
     Or nothing, and 0, where it is not to be used: flags (counts[10]) with bit 0 clear (not fresh) or bit 2 set (at full
@@ -148,9 +147,9 @@ def lean(state, counts) -> int:
     y = ((c[1] & 0xFFFF) ^ 0x8000) - 0x8000
     z = ((c[2] & 0xFFFF) ^ 0x8000) - 0x8000
     n = (x * x >> 2) + (y * y >> 2) + (z * z >> 2)
-    if n < s[LOW]:
+    if n < s[_LOW]:
         return 0
-    s[Z] = int(direction(y << 12, z << 12))
+    s[_Z] = int(direction(y << 12, z << 12))
     n = ((y * y + 1) >> 1) + ((z * z + 1) >> 1)
     if n:
         shift = 0
@@ -165,7 +164,7 @@ def lean(state, counts) -> int:
         y = (y + n // y) >> 1
         y = (y + n // y) >> 1
         n = ((y << 13) + (((n - y * y) << 12) // y)) >> shift
-    s[Z + 1] = int(direction(0 - (x << 12), n))
+    s[_Z + 1] = int(direction(0 - (x << 12), n))
     return 1
 
 
@@ -173,18 +172,18 @@ def lean(state, counts) -> int:
 def compose(s: ptr32):
     """Q of the half angles' sines and cosines in S and C: Rz(yaw) Ry(pitch) Rx(roll)."""
     k = 0
-    if s[PROBE] > 0:
+    if s[_PROBE] > 0:
         k = 32
-    n = s[S + 1] << k >> k
+    n = s[_S + 1] << k >> k
     sh = (n + 16384) >> 15
     sl = n - (sh << 15)
-    n = s[C + 1] << k >> k
+    n = s[_C + 1] << k >> k
     ch = (n + 16384) >> 15
     cl = n - (ch << 15)
-    n = s[S + 2] << k >> k
+    n = s[_S + 2] << k >> k
     yh = (n + 16384) >> 15
     yl = n - (yh << 15)
-    n = s[C + 2] << k >> k
+    n = s[_C + 2] << k >> k
     xh = (n + 16384) >> 15
     xl = n - (xh << 15)
     # pitch and yaw
@@ -192,10 +191,10 @@ def compose(s: ptr32):
     x = (sh * yh << 1) + ((sh * yl + sl * yh + 8192) >> 14)
     y = (sh * xh << 1) + ((sh * xl + sl * xh + 8192) >> 14)
     z = (ch * yh << 1) + ((ch * yl + cl * yh + 8192) >> 14)
-    n = s[S] << k >> k
+    n = s[_S] << k >> k
     sh = (n + 16384) >> 15
     sl = n - (sh << 15)
-    n = s[C] << k >> k
+    n = s[_C] << k >> k
     ch = (n + 16384) >> 15
     cl = n - (ch << 15)
     # and roll: w = c w + s x, x = s w - c x, y = c y + s z, z = c z - s y
@@ -204,14 +203,14 @@ def compose(s: ptr32):
     yh = (x + 16384) >> 15
     yl = x - (yh << 15)
     n = (ch * xh + sh * yh) << 1
-    s[Q] = n + ((ch * xl + cl * xh + sh * yl + sl * yh + 8192) >> 14)
+    s[_Q] = n + ((ch * xl + cl * xh + sh * yl + sl * yh + 8192) >> 14)
     n = (sh * xh - ch * yh) << 1
-    s[Q + 1] = n + ((sh * xl + sl * xh - ch * yl - cl * yh + 8192) >> 14)
+    s[_Q + 1] = n + ((sh * xl + sl * xh - ch * yl - cl * yh + 8192) >> 14)
     xh = (y + 16384) >> 15
     xl = y - (xh << 15)
     yh = (z + 16384) >> 15
     yl = z - (yh << 15)
     n = (ch * xh + sh * yh) << 1
-    s[Q + 2] = n + ((ch * xl + cl * xh + sh * yl + sl * yh + 8192) >> 14)
+    s[_Q + 2] = n + ((ch * xl + cl * xh + sh * yl + sl * yh + 8192) >> 14)
     n = (ch * yh - sh * xh) << 1
-    s[Q + 3] = n + ((ch * yl + cl * yh - sh * xl - sl * xh + 8192) >> 14)
+    s[_Q + 3] = n + ((ch * yl + cl * yh - sh * xl - sl * xh + 8192) >> 14)

@@ -14,17 +14,18 @@ from array import array
 import micropython
 from micropython import const
 
-PROBE = const(0)  # always -1
-Q = const(1)  # 4 words: quaternion w x y z, body to earth, Q29
-QR = const(5)  # 4: what rounding has left of it, 2**-44, 0..32767
-W = const(9)  # 3: half the angle of this step (rad), Q31
-WR = const(12)  # 3: what rounding has left of it, 2**-46, 0..32767
-V = const(15)  # 3: a measured vector, scaled so that its length is 2**15..2**16
-VR = const(18)  # 1: 2**30 / that length, 16384..32768
-UP = const(19)  # 3: the estimated up (gravity's reaction) in the body, Q28
-E = const(22)  # 3: the attitude error as a rotation vector in the body, Q29; see north()
-LOW = const(25)  # 1: least squared length / 4 of the accelerometer's counts that is used, 4..2**28
-OWN = const(26)  # the filter's own words follow
+# -- words of the state: written by tools/upright_host/words.py
+_PROBE = const(0)  # always -1: ptr32 zero-extends on 64-bit ports, see fixmath.py
+_Q = const(1)  # 4, Q29: quaternion w x y z, body to earth
+_QR = const(5)  # 4, Q44: what rounding has left of it, 0..32767
+_W = const(9)  # 3, Q31: half the angle of this step, rad
+_WR = const(12)  # 3, Q46: what rounding has left of it, 0..32767
+_V = const(15)  # 3: a measured vector, scaled so that its length is 2**15..2**16
+_VR = const(18)  # Q30: 1 / that length, 16384..32768
+_UP = const(19)  # 3, Q28: the estimated up (gravity's reaction) in the body
+_E = const(22)  # 3, Q29: the attitude error as a rotation vector in the body; see fixmath.north
+_LOW = const(25)  # least squared length / 4 of the accelerometer's counts that is used, 4..2**28
+# -- end of the words
 
 ONE = const(1 << 29)  # 1.0 in Q29
 
@@ -50,16 +51,16 @@ def tilt(s: ptr32, counts: ptr16):
     less than the rounding of VR). The relative error of VR is below 1.5e-4 and acts as a gain, not as
     an offset.
     """
-    s[E] = 0
-    s[E + 1] = 0
-    s[E + 2] = 0
+    s[_E] = 0
+    s[_E + 1] = 0
+    s[_E + 2] = 0
     if counts[10] & 5 != 1:
         return
     x = ((counts[0] & 0xFFFF) ^ 0x8000) - 0x8000
     y = ((counts[1] & 0xFFFF) ^ 0x8000) - 0x8000
     z = ((counts[2] & 0xFFFF) ^ 0x8000) - 0x8000
     n = (x * x >> 2) + (y * y >> 2) + (z * z >> 2)
-    if n < s[LOW]:
+    if n < s[_LOW]:
         return
     shift = 0
     while n < 0x10000000:  # at most 13 times
@@ -77,32 +78,32 @@ def tilt(s: ptr32, counts: ptr16):
     r = r * (49152 - (n * (r * r >> 14) >> 15)) >> 15
     if r > 32768:
         r = 32768
-    s[V] = x
-    s[V + 1] = y
-    s[V + 2] = z
-    s[VR] = r
+    s[_V] = x
+    s[_V + 1] = y
+    s[_V + 2] = z
+    s[_VR] = r
     k = 0
-    if s[PROBE] > 0:
+    if s[_PROBE] > 0:
         k = 32
-    q = s[Q] << k >> k
+    q = s[_Q] << k >> k
     h0 = (q + 16384) >> 15
     l0 = q - (h0 << 15)
-    q = s[Q + 1] << k >> k
+    q = s[_Q + 1] << k >> k
     h1 = (q + 16384) >> 15
     l1 = q - (h1 << 15)
-    q = s[Q + 2] << k >> k
+    q = s[_Q + 2] << k >> k
     h2 = (q + 16384) >> 15
     l2 = q - (h2 << 15)
-    q = s[Q + 3] << k >> k
+    q = s[_Q + 3] << k >> k
     h3 = (q + 16384) >> 15
     l3 = q - (h3 << 15)
     u = ((h1 * h3 - h0 * h2) << 1) + ((h1 * l3 + l1 * h3 - h0 * l2 - l0 * h2 + 8192) >> 14)
     v = ((h0 * h1 + h2 * h3) << 1) + ((h0 * l1 + l0 * h1 + h2 * l3 + l2 * h3 + 8192) >> 14)
     w = h0 * h0 - h1 * h1 - h2 * h2 + h3 * h3
     w += (h0 * l0 - h1 * l1 - h2 * l2 + h3 * l3 + 8192) >> 14
-    s[UP] = u
-    s[UP + 1] = v
-    s[UP + 2] = w
+    s[_UP] = u
+    s[_UP + 1] = v
+    s[_UP + 2] = w
     # the cross product of the unscaled vector, 14 bits of UP at a time; its length comes in last
     h0 = (u + 8192) >> 14
     h1 = (v + 8192) >> 14
@@ -112,13 +113,13 @@ def tilt(s: ptr32, counts: ptr16):
     l2 = w - (h2 << 14)
     q = y * h2 - z * h1 + ((y * l2 - z * l1 + 8192) >> 14)
     h3 = (q + 16384) >> 15
-    s[E] = h3 * r + (((q - (h3 << 15)) * r + 16384) >> 15)
+    s[_E] = h3 * r + (((q - (h3 << 15)) * r + 16384) >> 15)
     q = z * h0 - x * h2 + ((z * l0 - x * l2 + 8192) >> 14)
     h3 = (q + 16384) >> 15
-    s[E + 1] = h3 * r + (((q - (h3 << 15)) * r + 16384) >> 15)
+    s[_E + 1] = h3 * r + (((q - (h3 << 15)) * r + 16384) >> 15)
     q = x * h1 - y * h0 + ((x * l1 - y * l0 + 8192) >> 14)
     h3 = (q + 16384) >> 15
-    s[E + 2] = h3 * r + (((q - (h3 << 15)) * r + 16384) >> 15)
+    s[_E + 2] = h3 * r + (((q - (h3 << 15)) * r + 16384) >> 15)
 
 
 @micropython.viper
@@ -163,18 +164,18 @@ def north(s: ptr32, counts: ptr16, steps: int) -> int:
     h2 = z >> 1
     gain = 0x1FFFFFFF // ((h0 * h0 + h1 * h1 + h2 * h2) >> 14)  # 2**45 / |m|**2
     k = 0
-    if s[PROBE] > 0:
+    if s[_PROBE] > 0:
         k = 32
-    n = s[Q] << k >> k
+    n = s[_Q] << k >> k
     h0 = (n + 16384) >> 15
     l0 = n - (h0 << 15)
-    n = s[Q + 1] << k >> k
+    n = s[_Q + 1] << k >> k
     h1 = (n + 16384) >> 15
     l1 = n - (h1 << 15)
-    n = s[Q + 2] << k >> k
+    n = s[_Q + 2] << k >> k
     h2 = (n + 16384) >> 15
     l2 = n - (h2 << 15)
-    n = s[Q + 3] << k >> k
+    n = s[_Q + 3] << k >> k
     h3 = (n + 16384) >> 15
     l3 = n - (h3 << 15)
     # row 2 of R (west in the body), Q28, and py = 2**14 |m| hy, 14 bits of it at a time
@@ -238,11 +239,11 @@ def north(s: ptr32, counts: ptr16, steps: int) -> int:
     z -= h2 << 14
     n = 1 << down >> 1
     u = n0 * h0 + w0 * h1 + u0 * h2 + ((n0 * x + w0 * y + u0 * z + 8192) >> 14)
-    s[E] = (((s[E] << k >> k) + n) >> down) + u
+    s[_E] = (((s[_E] << k >> k) + n) >> down) + u
     u = n1 * h0 + w1 * h1 + u1 * h2 + ((n1 * x + w1 * y + u1 * z + 8192) >> 14)
-    s[E + 1] = (((s[E + 1] << k >> k) + n) >> down) + u
+    s[_E + 1] = (((s[_E + 1] << k >> k) + n) >> down) + u
     u = n2 * h0 + w2 * h1 + u2 * h2 + ((n2 * x + w2 * y + u2 * z + 8192) >> 14)
-    s[E + 2] = (((s[E + 2] << k >> k) + n) >> down) + u
+    s[_E + 2] = (((s[_E + 2] << k >> k) + n) >> down) + u
     if steps == 0:
         down = -1
     return down
@@ -258,11 +259,11 @@ def turn(s: ptr32):
     carried in WR and QR. W becomes d sin|d| / |d|.
     """
     k = 0
-    if s[PROBE] > 0:
+    if s[_PROBE] > 0:
         k = 32
-    x = s[W] << k >> k
-    y = s[W + 1] << k >> k
-    z = s[W + 2] << k >> k
+    x = s[_W] << k >> k
+    y = s[_W + 1] << k >> k
+    z = s[_W + 2] << k >> k
     xh = (x + 32768) >> 16
     yh = (y + 32768) >> 16
     zh = (z + 32768) >> 16
@@ -286,19 +287,19 @@ def turn(s: ptr32):
     # d sin(d)/|d| = d - d c
     h = (c + 16384) >> 15
     c -= h << 15
-    p = s[WR] - xh * c - ((xl * h + (xl * c >> 15)) >> 1)
-    s[WR] = p & 32767
+    p = s[_WR] - xh * c - ((xl * h + (xl * c >> 15)) >> 1)
+    s[_WR] = p & 32767
     x += (p >> 15) - xh * h
-    p = s[WR + 1] - yh * c - ((yl * h + (yl * c >> 15)) >> 1)
-    s[WR + 1] = p & 32767
+    p = s[_WR + 1] - yh * c - ((yl * h + (yl * c >> 15)) >> 1)
+    s[_WR + 1] = p & 32767
     y += (p >> 15) - yh * h
-    p = s[WR + 2] - zh * c - ((zl * h + (zl * c >> 15)) >> 1)
-    s[WR + 2] = p & 32767
+    p = s[_WR + 2] - zh * c - ((zl * h + (zl * c >> 15)) >> 1)
+    s[_WR + 2] = p & 32767
     z += (p >> 15) - zh * h
-    q0 = s[Q] << k >> k
-    q1 = s[Q + 1] << k >> k
-    q2 = s[Q + 2] << k >> k
-    q3 = s[Q + 3] << k >> k
+    q0 = s[_Q] << k >> k
+    q1 = s[_Q + 1] << k >> k
+    q2 = s[_Q + 2] << k >> k
+    q3 = s[_Q + 3] << k >> k
     h0 = (q0 + 16384) >> 15
     h1 = (q1 + 16384) >> 15
     h2 = (q2 + 16384) >> 15
@@ -321,21 +322,21 @@ def turn(s: ptr32):
     yl = y - (yh << 16)
     zl = z - (zh << 16)
     r = l0 * n - l1 * xh - l2 * yh - l3 * zh
-    r += s[QR] + ((h0 * p - h1 * xl - h2 * yl - h3 * zl) >> 1)
-    s[QR] = r & 32767
-    s[Q] = q0 + h0 * n - h1 * xh - h2 * yh - h3 * zh + (r >> 15)
+    r += s[_QR] + ((h0 * p - h1 * xl - h2 * yl - h3 * zl) >> 1)
+    s[_QR] = r & 32767
+    s[_Q] = q0 + h0 * n - h1 * xh - h2 * yh - h3 * zh + (r >> 15)
     r = l0 * xh + l1 * n + l2 * zh - l3 * yh
-    r += s[QR + 1] + ((h0 * xl + h1 * p + h2 * zl - h3 * yl) >> 1)
-    s[QR + 1] = r & 32767
-    s[Q + 1] = q1 + h0 * xh + h1 * n + h2 * zh - h3 * yh + (r >> 15)
+    r += s[_QR + 1] + ((h0 * xl + h1 * p + h2 * zl - h3 * yl) >> 1)
+    s[_QR + 1] = r & 32767
+    s[_Q + 1] = q1 + h0 * xh + h1 * n + h2 * zh - h3 * yh + (r >> 15)
     r = l0 * yh - l1 * zh + l2 * n + l3 * xh
-    r += s[QR + 2] + ((h0 * yl - h1 * zl + h2 * p + h3 * xl) >> 1)
-    s[QR + 2] = r & 32767
-    s[Q + 2] = q2 + h0 * yh - h1 * zh + h2 * n + h3 * xh + (r >> 15)
+    r += s[_QR + 2] + ((h0 * yl - h1 * zl + h2 * p + h3 * xl) >> 1)
+    s[_QR + 2] = r & 32767
+    s[_Q + 2] = q2 + h0 * yh - h1 * zh + h2 * n + h3 * xh + (r >> 15)
     r = l0 * zh + l1 * yh - l2 * xh + l3 * n
-    r += s[QR + 3] + ((h0 * zl + h1 * yl - h2 * xl + h3 * p) >> 1)
-    s[QR + 3] = r & 32767
-    s[Q + 3] = q3 + h0 * zh + h1 * yh - h2 * xh + h3 * n + (r >> 15)
+    r += s[_QR + 3] + ((h0 * zl + h1 * yl - h2 * xl + h3 * p) >> 1)
+    s[_QR + 3] = r & 32767
+    s[_Q + 3] = q3 + h0 * zh + h1 * yh - h2 * xh + h3 * n + (r >> 15)
 
 
 # ------------------------------------- main loop: allocates nothing, shares no memory with a tick
@@ -538,7 +539,7 @@ def unit_quaternion(w, x, y, z):
     return tuple([ratio(v << 61, norm) for v in parts])
 
 
-def level(x, y, z):
+def attitude_from_up(x, y, z):
     """The attitude with yaw 0 (order zyx) in which the body vector (x, y, z), ints, points up.
 
     Returns (w, x, y, z) in Q29: roll = atan2(y, z), pitch = atan2(-x, hypot(y, z)). Raises
@@ -553,20 +554,20 @@ def level(x, y, z):
     return unit_quaternion(pitch_c * roll_c, pitch_c * roll_s, pitch_s * roll_c, -pitch_s * roll_s)
 
 
-def level_north(up, field):
+def attitude_from_up_and_north(up, field):
     """The attitude in which the body vector `up` points up and `field`'s horizontal part to x, north.
 
     up, field: 3 ints each, neither 0 nor along the other. Returns (w, x, y, z) in Q29.
     """
     x, y, z = up
-    w, i, j, k = level(x, y, z)
-    # north and west of the field in the frame of level(), both times hypot(y, z) |up|
+    w, i, j, k = attitude_from_up(x, y, z)
+    # north and west of the field in the frame of attitude_from_up, both times hypot(y, z) |up|
     side = y * y + z * z
     norm = isqrt((x * x + side) << 64)
     if side:
         north = (field[0] * side - x * (y * field[1] + z * field[2])) << 32
         west = (z * field[1] - y * field[2]) * norm
-    else:  # level() has roll 0 there
+    else:  # attitude_from_up has roll 0 there
         north = -x * field[2] << 32
         west = norm * field[1]
     c, s = _half(north, -west, isqrt(north * north + west * west))

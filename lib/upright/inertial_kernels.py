@@ -1,125 +1,112 @@
-# Integer kernels of the inertial-frame Mahony filter (inertial_mahony.py): levelling, rest, gyro bias, magnetic field.
-# Needs the viper emitter of MicroPython, or CPython with a stand-in `micropython` module. All of it is made for a
-# hard interrupt: it allocates nothing, raises nothing, uses no float, and gives the same bits on every port.
-#
-# The kernels work on the filter's state, one array('i') that starts as fixmath.py's (probe, quaternion, half angle;
-# `turn` needs no more). A block is 2**BLOCK steps of 22 to 44 ms together (up to 80 ms below 90 Hz): what is slow
-# runs once a block, each part on a step of its own, so its constants do not depend on the sample rate. Bounds:
-# docs/numerics.md.
-
-from array import array
+# Integer kernels of the inertial-frame Mahony filter (inertial.py): levelling, rest, gyro bias, magnetic field. Needs
+# the viper emitter; earth_kernels.py has what is not this filter's alone, and what a state and a block are. All of it
+# is made for a hard interrupt: it allocates nothing, raises nothing, uses no float, and gives the same bits on every
+# port. K, T, y ...: the names of the equations in docs/methods.md; the float twin is host_tests/reference.
 
 import micropython
 from micropython import const
 
-_PROBE = const(0)
-_Q = const(1)
-_G = const(15)  # half angle per step of one gyro count, Q31 ...
-_GR = const(16)  # ... and its last bits, 2**-46, 0..32767
-_O = const(17)  # 3: minus the bias as a half angle per step, Q31
-_OR = const(20)  # 3: its last bits, 2**-46, -32767..32767
-# the filter's own words, after fixmath's WR; inertial_mahony.py has the same list
-_CE = const(23)  # 3: correction of the next step in the earth frame, half angle, Q31
-_R = const(26)  # 9: rotation matrix; rows are north, west, up in the body; Q15
-_S = const(35)  # 3: low-passed specific force in the earth frame, counts, Q14
-_OFF = const(38)  # 2: its last sample less the low-pass, horizontal, counts, Q14
-_K = const(40)  # tilt gain times dt = K / 2**K_SHIFT, K < 2**15
-_K_SHIFT = const(41)
-_KC = const(42)  # the same for S (normalised) to half angle
-_KC_SHIFT = const(43)
-_N = const(44)  # fresh steps since the start of the ramp, no more than N_END
-_N_RAMP = const(45)  # steps of the ramp
-_N_LATE = const(46)  # steps until the bias is estimated in motion
-_RAMP = const(47)  # ramp of the tilt, Q8
-_K_END = const(48)  # K after the ramp
-_K_END_SHIFT = const(49)
-_NORM = const(50)  # shift that brings 1 g to 2**14..2**15 counts
-_G1 = const(51)  # 1 g in counts
-_LI = const(52)  # 2**29 / (1 g, normalised)
-_OM_GAIN = const(53)  # 2**24 / (0.3 g, normalised)
-_BLOCK = const(54)  # log2 of the steps of a block
-_DECIDED = const(55)  # yes/no decisions, for the tests' float twin
-_X = const(56)  # 6: regressors north and west: inner low-pass, Q24
-_Y = const(62)  # 6: outer low-pass, Q24
-_Z = const(68)  # 3: regressor up, Q24
-_D = const(71)  # square of the horizontal deviation / (0.3 g)**2, Q15
-_OM = const(72)  # tilt confidence 1 / (1 + D), Q15
-_GS = const(73)  # 3: gyro counts summed over the block
-_LOW1 = const(76)  # 6: first low-pass of accelerometer, gyro less base; counts, Q12
-_LOW2 = const(82)  # 6: second
-_BASE = const(88)  # 3: gyro bias that was set, 1/256 count
-_B = const(91)  # 3: learned bias on top, counts, Q(B_SHIFT)
-_J = const(94)  # 3: information in blocks, Q14
-_II = const(97)  # 3: 1 / information in seconds, Q20
-_BLOCKS = const(100)  # of the rest detector's start
-_STILL = const(101)  # blocks without motion, no more than REST_AFTER
-_REST_AFTER = const(102)
-_REST_K = const(103)  # Q15
-_REST_GYRO = const(104)  # counts**2, Q6
-_REST_ACCEL = const(105)  # counts**2, Q6
-_REST_MOST = const(106)  # most that is taken for a bias, counts, Q12
-_REST_OFF = const(107)  # most that a known bias may be off, counts, Q12
-_J_KNOWN = const(108)  # blocks, Q14
-_UPSET = const(109)  # tilt at rest that restarts the ramps: (counts / 4)**2
-_B_SHIFT = const(110)
-_B_MAX = const(111)  # counts, Q(B_SHIFT)
-_CC = const(112)  # half angle (Q31) to counts (Q12): CC / 2**CC_SHIFT
-_CC_SHIFT = const(113)
-_CE_MAX = const(114)  # 4096 counts as a half angle, Q31
-_J_DECAY = const(115)  # 2**22 / blocks of 150 s
-_RATE_T = const(116)  # blocks a second, Q4
-_J_LEAST = const(117)  # first information, blocks, Q14
-_MS = const(118)  # 3: magnetometer in the earth frame, counts, Q9, summed over the block
-_MN = const(121)  # samples in it
-_SINCE = const(122)  # blocks since the last with a sample
-_J_MAG = const(123)  # blocks that the heading of this block stands for; 0: none
-_E = const(124)  # heading error, rad, Q28
-_NOW = const(125)  # 2: horizontal and vertical field, counts, Q13
-_HAVE = const(127)  # 1: field and candidate are set; 2: reference, too
-_F = const(128)  # 2: smoothed field, counts, Q13
-_FR = const(130)  # 2: reference
-_FC = const(132)  # 2: candidate
-_NEAR = const(134)  # blocks near the reference, no more than FIELD_AFTER
-_CAND = const(135)  # blocks near the candidate
-_REJECTED = const(136)  # blocks
-_WEIGHT = const(137)  # of the heading, in halves: 2 accepted, 1 after a long rejection, 0
-_TOL = const(138)  # tolerance squared, Q15
-_SMOOTH = const(139)  # blocks of 0.05 s, Q10
-_REF = const(140)  # blocks of the reference's time constant, Q10
-_FIELD_AFTER = const(141)
-_FIELD_FIRST = const(142)
-_FIELD_NEW = const(143)
-_REJECT_FOR = const(144)
-_TURNING_MIN = const(145)  # counts**2, Q4
-_AGREE = const(146)  # rad, Q28
-_HN = const(147)  # blocks since the start of the heading's ramp
-_LOST = const(148)  # blocks of large heading error
-_FAR_MIN = const(149)  # rad, Q28
-_RESTART_AFTER = const(150)
-_HRAMP = const(151)  # ramp of the heading, Q8
-_HK = const(152)  # heading gain of a block, Q22
-_LIMIT_AFTER = const(153)  # blocks
-_PUSH = const(154)  # heading correction of one block, rad, Q28
-_ZK = const(155)  # gain of it, Q22
-_PUSH_MAX = const(156)  # bound of it for the bias, rad, Q28
-_HC = const(157)  # PUSH to counts, Q12: HC / 2**(HC_SHIFT + 8)
-_HC_SHIFT = const(158)
-_DOUBT = const(159)  # heading uncertainty, rad, Q28
-_DOUBT_RATE = const(160)  # its growth in a block where 1/information is 1, rad, Q20
-_LITE = const(161)  # 1: no field rejection, no restart of the heading
-_LATE = const(162)  # 1: the bias is estimated in motion
-_C = const(163)  # 3: correction (north, west; up) in counts, Q12
-_U = const(166)  # 3: what the block tells about the bias, counts, Q15
-_O_BASE = const(169)  # 3: O of BASE alone
-_OR_BASE = const(172)  # 3: its last bits
-_N_END = const(175)  # steps after which the start is over
-_PHASE = const(176)  # fresh steps of the block
-_BLOCK_MASK = const(177)  # steps of a block less 1
-_NINE = const(178)  # 1: use the magnetometer
-_HK_DOUBT = const(179)  # heading gain of a block where 1/information is 1, Q22
-_GAP = const(180)  # steps since the last fresh sample
-_OUTAGE = const(181)  # steps without one that restart the ramps
-WORDS = const(182)
+from upright.earth_kernels import low_pass
+
+# -- words of the state: written by tools/upright_host/words.py
+_PROBE = const(0)  # always -1, see fixmath.py
+_G = const(15)  # Q31: half angle per step of one gyro count
+_GR = const(16)  # Q46: its last bits, 0..32767
+_O = const(17)  # 3, Q31: minus the bias as a half angle per step
+_OR = const(20)  # 3, Q46: its last bits, -32767..32767
+_BASE = const(23)  # 3, Q8: gyro bias that was set, counts
+_O_BASE = const(26)  # 3, Q31: O of BASE alone
+_OR_BASE = const(29)  # 3, Q46: its last bits
+_B = const(32)  # 3: learnt bias on top of BASE, in the filter's own unit
+_TURN = const(35)  # 3, Q31: correction that the next step takes up, earth frame, half angle
+_R = const(38)  # 9, Q15: rotation matrix; its rows are north, west, up in the body
+_FORCE = const(47)  # 3, Q15: specific force of this sample in the earth frame, counts
+_BLOCK = const(51)  # log2 of the steps of a block
+_DECIDED = const(54)  # yes/no decisions, for the tests' float twin
+_GS = const(55)  # 3: gyro counts summed over the block
+_J = const(63)  # blocks that the heading of this block stands for; 0: none
+_HEADING = const(64)  # Q28: heading error, rad
+_NOW = const(65)  # 2, Q13: horizontal and vertical field, counts
+_IN = const(67)  # 6, Q12: what LOW1 takes up: accelerometer, gyro less BASE, counts
+_LOW2 = const(79)  # 6, Q12: second
+_AWAY = const(85)  # 2, Q6: squared distance from LOW2 of accelerometer and gyro, counts**2
+_STILL = const(88)  # blocks without motion, no more than REST_AFTER
+_REST_AFTER = const(89)  # blocks
+_REST_GYRO = const(91)  # Q6: at rest AWAY is less: counts**2
+_REST_ACCEL = const(92)  # Q6: the same of the accelerometer
+_REST_MOST = const(93)  # Q12: most that is taken for a bias, counts
+_SEEN = const(94)  # 6, Q12: as IN, but the gyro of this one sample
+_S = const(100)  # 3, Q14: low-passed specific force in the earth frame, counts
+_OFF = const(103)  # 2, Q14: its last sample less the low-pass, horizontal, counts
+_K = const(105)  # tilt gain times dt = K / 2**K_SHIFT, K < 2**15
+_K_SHIFT = const(106)
+_KC = const(107)  # the same for S (normalised) to half angle
+_KC_SHIFT = const(108)
+_N = const(109)  # fresh steps since the start of the ramp, no more than N_END
+_N_RAMP = const(110)  # steps of the ramp
+_N_LATE = const(111)  # steps until the bias is estimated in motion
+_LATE = const(113)  # 1: the bias is estimated in motion
+_RAMP = const(114)  # Q8: ramp of the tilt
+_K_END = const(115)  # K after the ramp
+_K_END_SHIFT = const(116)
+_NORM = const(117)  # shift that brings 1 g to 2**14..2**15 counts
+_G1 = const(118)  # 1 g in counts
+_LI = const(119)  # Q29: 1 / (1 g, normalised)
+_OM_GAIN = const(120)  # Q24: 1 / (0.3 g, normalised)
+_X = const(121)  # 6, Q24: regressors north and west: inner low-pass
+_Y = const(127)  # 6, Q24: outer low-pass
+_Z = const(133)  # 3, Q24: regressor up
+_D = const(136)  # Q15: square of the horizontal deviation / (0.3 g)**2
+_OM = const(137)  # Q15: tilt confidence 1 / (1 + D)
+_U = const(138)  # 3, Q15: what the block tells about the bias, counts
+_INFO = const(141)  # 3, Q14: information about it, blocks
+_II = const(144)  # 3, Q20: 1 / information in seconds
+_INFO_LEAST = const(147)  # Q14: first information, blocks
+_INFO_KNOWN = const(148)  # Q14: with more the bias is well known, blocks
+_INFO_DECAY = const(149)  # Q22: 1 / blocks of 150 s
+_RATE_T = const(150)  # Q4: blocks a second
+_REST_OFF = const(151)  # Q12: most that a known bias may be off, counts
+_UPSET = const(152)  # tilt at rest that restarts the ramps: (counts / 4)**2
+_B_SHIFT = const(153)  # B is in counts, Q(B_SHIFT)
+_B_MAX = const(154)  # its bound
+_C = const(155)  # 3, Q12: correction (north, west; up) in counts
+_CC = const(158)  # half angle (Q31) to counts (Q12): CC / 2**CC_SHIFT
+_CC_SHIFT = const(159)
+_TURN_MAX = const(160)  # Q31: 4096 counts as a half angle
+_HAVE = const(161)  # 1: field and candidate are set; 2: reference, too
+_F = const(162)  # 2, Q13: smoothed field, counts
+_FR = const(164)  # 2, Q13: reference; F, FR and FC stand together
+_FC = const(166)  # 2, Q13: candidate
+_NEAR = const(168)  # blocks near the reference, no more than FIELD_AFTER
+_CAND = const(169)  # blocks near the candidate
+_REJECTED = const(170)  # blocks
+_WEIGHT = const(171)  # of the heading, in halves: 2 accepted, 1 after a long rejection, 0
+_TOL = const(172)  # Q15: tolerance squared
+_SMOOTH = const(173)  # Q10: blocks of 0.05 s
+_REF = const(174)  # Q10: blocks of the reference's time constant
+_FIELD_AFTER = const(175)  # blocks
+_FIELD_FIRST = const(176)  # blocks
+_FIELD_NEW = const(177)  # blocks
+_REJECT_FOR = const(178)  # blocks
+_TURNING_MIN = const(179)  # Q4: counts**2
+_AGREE = const(180)  # Q28: rad
+_HN = const(181)  # blocks since the start of the heading's ramp
+_LOST = const(182)  # blocks of large heading error
+_FAR_MIN = const(183)  # Q28: rad
+_RESTART_AFTER = const(184)  # blocks
+_HRAMP = const(185)  # Q8: ramp of the heading
+_HK = const(186)  # Q22: heading gain of a block
+_HK_DOUBT = const(187)  # Q22: the same where 1 / information is 1
+_LIMIT_AFTER = const(188)  # blocks
+_PUSH = const(189)  # Q28: heading correction of one block, rad
+_ZK = const(190)  # Q22: gain of it
+_PUSH_MAX = const(191)  # Q28: bound of it for the bias, rad
+_HC = const(192)  # PUSH to counts, Q12: HC / 2**(HC_SHIFT + 8)
+_HC_SHIFT = const(193)
+_DOUBT = const(194)  # Q28: heading uncertainty, rad
+_DOUBT_RATE = const(195)  # Q20: its growth in a block where 1 / information is 1, rad
+_LITE = const(196)  # 1: no field rejection, no restart of the heading
+# -- end of the words
 
 _STILL_BIT = const(1)
 _NEAR_REFERENCE = const(2)
@@ -131,15 +118,7 @@ _AGREES = const(64)
 _UPSET_BIT = const(128)
 
 _LIMIT = const(42949673)  # 0.16 rad, Q28
-PI28 = const(843314857)  # pi, Q28
-
-# atan(2**-i) in rad, Q28
-# fmt: off
-_ATAN = array("i", [
-    210828714, 124459457, 65760959, 33381290, 16755422, 8385879, 4193963, 2097109, 1048571,
-    524287, 262144, 131072, 65536, 32768, 16384, 8192, 4096, 2048, 1024, 512,
-])
-# fmt: on
+_PI28 = const(843314857)  # pi, Q28
 
 
 # ------------------------------------------------------------------------------------------ every step
@@ -173,68 +152,26 @@ def ramp(s: ptr32):
 
 
 @micropython.viper
-def level(s: ptr32, counts: ptr16):
-    """R of Q; the specific force in the earth frame, R a, goes into its low-pass S.
-
-    a is as measured: neither normalised nor left out at full scale, so that what comes in swings cancels.
-    """
+def level(s: ptr32):
+    """S takes up FORCE; TURN: the turn that levels S, each part at most K dt; upside down, 1.4 K dt as a whole."""
     k = 0
     if s[_PROBE] > 0:
         k = 32
-    a = ((s[_Q] << k >> k) + 8192) >> 14
-    b = ((s[_Q + 1] << k >> k) + 8192) >> 14
-    c = ((s[_Q + 2] << k >> k) + 8192) >> 14
-    d = ((s[_Q + 3] << k >> k) + 8192) >> 14
-    x = ((counts[0] & 0xFFFF) ^ 0x8000) - 0x8000
-    y = ((counts[1] & 0xFFFF) ^ 0x8000) - 0x8000
-    z = ((counts[2] & 0xFFFF) ^ 0x8000) - 0x8000
+    # OFF = FORCE - S; S += 2 K dt OFF
     gain = s[_K]
     shift = s[_K_SHIFT] - 16  # twice K, and 15 bits are in the split
     half = 1 << shift >> 1
-    m = 32768 - ((c * c + d * d + 8192) >> 14)
-    n = (b * c - a * d + 8192) >> 14
-    o = (b * d + a * c + 8192) >> 14
-    s[_R] = m
-    s[_R + 1] = n
-    s[_R + 2] = o
-    f = s[_S] << k >> k
-    h = ((m * x + n * y + o * z) >> 1) - f
-    s[_OFF] = h
-    m = (h + 32768) >> 16
-    n = h - (m << 16)
-    s[_S] = f + (((m * gain << 1) + (n * gain >> 15) + half) >> shift)
-    m = (b * c + a * d + 8192) >> 14
-    n = 32768 - ((b * b + d * d + 8192) >> 14)
-    o = (c * d - a * b + 8192) >> 14
-    s[_R + 3] = m
-    s[_R + 4] = n
-    s[_R + 5] = o
-    f = s[_S + 1] << k >> k
-    h = ((m * x + n * y + o * z) >> 1) - f
-    s[_OFF + 1] = h
-    m = (h + 32768) >> 16
-    n = h - (m << 16)
-    s[_S + 1] = f + (((m * gain << 1) + (n * gain >> 15) + half) >> shift)
-    m = (b * d - a * c + 8192) >> 14
-    n = (c * d + a * b + 8192) >> 14
-    o = 32768 - ((b * b + c * c + 8192) >> 14)
-    s[_R + 6] = m
-    s[_R + 7] = n
-    s[_R + 8] = o
-    f = s[_S + 2] << k >> k
-    h = ((m * x + n * y + o * z) >> 1) - f
-    m = (h + 32768) >> 16
-    n = h - (m << 16)
-    f += ((m * gain << 1) + (n * gain >> 15) + half) >> shift
-    s[_S + 2] = f
-
-
-@micropython.viper
-def lean(s: ptr32):
-    """CE: the turn that levels S, K dt (S1, -S0) / g, each part at most K dt; upside down, 1.4 K dt as a whole."""
-    k = 0
-    if s[_PROBE] > 0:
-        k = 32
+    i = 0
+    while i < 3:
+        x = s[_S + i] << k >> k
+        y = ((s[_FORCE + i] << k >> k) >> 1) - x
+        if i < 2:
+            s[_OFF + i] = y
+        h = (y + 32768) >> 16
+        y -= h << 16
+        s[_S + i] = x + (((h * gain << 1) + (y * gain >> 15) + half) >> shift)
+        i += 1
+    # (x, y): S, no part of it more than 1 g
     most = s[_G1] << 14
     x = s[_S] << k >> k
     if x > most:
@@ -251,6 +188,7 @@ def lean(s: ptr32):
     y <<= n
     decided = s[_DECIDED] | _OVER
     if (s[_S + 2] << k >> k) < 0:
+        # upside down: (x, y) *= 1.4 / |(x, y)| where that is shorter than 1 g
         most = s[_G1] << n
         i = (x + 8192) >> 14
         j = (y + 8192) >> 14
@@ -271,109 +209,68 @@ def lean(s: ptr32):
     else:
         decided ^= _OVER
     s[_DECIDED] = decided
+    # TURN = K dt (y, -x)
     gain = s[_KC]
     shift = s[_KC_SHIFT] - 14
     half = 1 << shift >> 1
     h = (y + 8192) >> 14
-    s[_CE] = (h * gain + ((y - (h << 14)) * gain >> 14) + half) >> shift
+    s[_TURN] = (h * gain + ((y - (h << 14)) * gain >> 14) + half) >> shift
     h = (x + 8192) >> 14
-    s[_CE + 1] = 0 - ((h * gain + ((x - (h << 14)) * gain >> 14) + half) >> shift)
-
-
-@micropython.viper
-def gather(s: ptr32, counts: ptr16):
-    """Add a magnetometer sample, turned into the earth frame, to the block's sum.
-
-    Left out: all zero, an axis at full scale.
-    """
-    k = 0
-    if s[_PROBE] > 0:
-        k = 32
-    x = ((counts[6] & 0xFFFF) ^ 0x8000) - 0x8000
-    y = ((counts[7] & 0xFFFF) ^ 0x8000) - 0x8000
-    z = ((counts[8] & 0xFFFF) ^ 0x8000) - 0x8000
-    if (x | y | z) == 0:
-        return
-    if x > 32766 or y > 32766 or z > 32766 or x < -32766 or y < -32766 or z < -32766:
-        return
-    s[_MN] += 1
-    t = (s[_R] << k >> k) * x + (s[_R + 1] << k >> k) * y + (s[_R + 2] << k >> k) * z
-    s[_MS] = (s[_MS] << k >> k) + ((t + 32) >> 6)
-    t = (s[_R + 3] << k >> k) * x + (s[_R + 4] << k >> k) * y + (s[_R + 5] << k >> k) * z
-    s[_MS + 1] = (s[_MS + 1] << k >> k) + ((t + 32) >> 6)
-    t = (s[_R + 6] << k >> k) * x + (s[_R + 7] << k >> k) * y + (s[_R + 8] << k >> k) * z
-    s[_MS + 2] = (s[_MS + 2] << k >> k) + ((t + 32) >> 6)
+    s[_TURN + 1] = 0 - ((h * gain + ((x - (h << 14)) * gain >> 14) + half) >> shift)
 
 
 # ------------------------------------------------------------------------------------------ once a block
 @micropython.viper
-def rest(s: ptr32, counts: ptr16):
-    """Rest: gyro and accelerometer stay near their two-pole low-passes, the gyro near its bias where that is known.
+def detect_rest(state, counts):
+    """STILL: for how long gyro and accelerometer have stayed near their low-passes, the gyro near a well-known bias.
 
-    A block's mean goes into the gyro's low-pass; what is judged is the sample.
-    At rest a tilt error that cannot be restarts the ramps.
+    A block's mean goes into the gyro's low-pass; what is judged is the sample. At rest a tilt error that cannot be
+    restarts the ramps.
     """
+    s = ptr32(state)
+    c = ptr16(counts)
     k = 0
     if s[_PROBE] > 0:
         k = 32
-    gain = s[_REST_K]
-    i = s[_BLOCKS] + 1
-    if i * gain < 32768:
-        s[_BLOCKS] = i
-        gain = 32768 // i  # the mean of all, until the low-pass takes over
-    b_shift = s[_B_SHIFT] - 12
     fine = 12 - s[_BLOCK]
-    still = 1
-    gyro = 0
-    accel = 0
     i = 0
-    while i < 6:
-        x = ((counts[i] & 0xFFFF) ^ 0x8000) - 0x8000
-        x <<= 12
-        v = x
-        if i > 2:
-            base = (s[_BASE + i - 3] << k >> k) << 4
-            x -= base
-            v = ((s[_GS + i - 3] << k >> k) << fine) - base
-            s[_GS + i - 3] = 0
-        f = s[_LOW1 + i] << k >> k
-        v -= f
-        h = v >> 15
-        f += h * gain + ((v - (h << 15)) * gain + 16384 >> 15)
-        s[_LOW1 + i] = f
-        v = s[_LOW2 + i] << k >> k
-        f -= v
-        h = f >> 15
-        v += h * gain + ((f - (h << 15)) * gain + 16384 >> 15)
-        s[_LOW2 + i] = v
-        x = (x - v) >> 9
+    while i < 3:
+        x = ((c[i] & 0xFFFF) ^ 0x8000) - 0x8000
+        s[_IN + i] = x << 12
+        s[_SEEN + i] = x << 12
+        y = (s[_BASE + i] << k >> k) << 4
+        x = ((c[3 + i] & 0xFFFF) ^ 0x8000) - 0x8000
+        s[_SEEN + 3 + i] = (x << 12) - y
+        s[_IN + 3 + i] = ((s[_GS + i] << k >> k) << fine) - y
+        s[_GS + i] = 0
+        i += 1
+    low_pass(state, _SEEN)
+    # still: |seen - LOW2| small, |gyro| < REST_MOST, and |gyro - B| < REST_OFF where INFO > INFO_KNOWN
+    still = s[_AWAY] < s[_REST_ACCEL] and s[_AWAY + 1] < s[_REST_GYRO]
+    shift = s[_B_SHIFT] - 12
+    i = 0
+    while i < 3:
+        x = s[_LOW2 + 3 + i] << k >> k
+        y = x - ((s[_B + i] << k >> k) >> shift)
+        if y < 0:
+            y = 0 - y
         if x < 0:
             x = 0 - x
-        if x > 16383:
-            x = 16383
-        if i < 3:
-            accel += x * x
-        else:
-            gyro += x * x
-            f = v - ((s[_B + i - 3] << k >> k) >> b_shift)
-            if f < 0:
-                f = 0 - f
-            if v < 0:
-                v = 0 - v
-            if v > s[_REST_MOST] or (s[_J + i - 3] > s[_J_KNOWN] and f > s[_REST_OFF]):
-                still = 0
+        if x > s[_REST_MOST] or (s[_INFO + i] > s[_INFO_KNOWN] and y > s[_REST_OFF]):
+            still = False
         i += 1
     decided = s[_DECIDED] | (_STILL_BIT | _UPSET_BIT)
     i = 0
-    if still and gyro < s[_REST_GYRO] and accel < s[_REST_ACCEL]:
+    if still:
         i = s[_STILL] + 1
         if i > s[_REST_AFTER]:
             i = s[_REST_AFTER]
     else:
         decided ^= _STILL_BIT
+    # upset: at rest, and the horizontal part of S is more than upset_g
     x = (s[_S] << k >> k) >> 16
-    v = (s[_S + 1] << k >> k) >> 16
-    if i == s[_REST_AFTER] and x * x + v * v > s[_UPSET]:
+    y = (s[_S + 1] << k >> k) >> 16
+    if i == s[_REST_AFTER] and x * x + y * y > s[_UPSET]:
         i = 0
         s[_N] = 0
         s[_LATE] = 0
@@ -430,74 +327,12 @@ def regress(s: ptr32):
 
 
 @micropython.viper
-def compass(s: ptr32):
-    """E: the heading error, from the block's mean field; NOW: its horizontal and vertical part. CORDIC."""
-    k = 0
-    if s[_PROBE] > 0:
-        k = 32
-    n = s[_MN]
-    j = s[_SINCE] + 1
-    if j > 16:
-        j = 16
-    s[_SINCE] = j
-    s[_J_MAG] = 0
-    if n == 0:
-        return
-    s[_J_MAG] = j
-    s[_SINCE] = 0
-    s[_MN] = 0
-    x = (s[_MS] << k >> k) // n << 4
-    y = 0 - ((s[_MS + 1] << k >> k) // n << 4)
-    s[_NOW + 1] = (s[_MS + 2] << k >> k) // n << 4
-    s[_MS] = 0
-    s[_MS + 1] = 0
-    s[_MS + 2] = 0
-    angle = 0
-    if x < 0:
-        angle = PI28
-        if y < 0:
-            angle = 0 - angle
-        x = 0 - x
-        y = 0 - y
-    t = y
-    if t < 0:
-        t = 0 - t
-    if x + t == 0:
-        s[_E] = 0
-        s[_NOW] = 0
-        return
-    shift = 0
-    while x + t < 0x10000000:
-        x <<= 1
-        y <<= 1
-        t <<= 1
-        shift += 1
-    table = ptr32(_ATAN)
-    i = 0
-    while i < 20:
-        t = y >> i
-        if y > 0:
-            y -= x >> i
-            x += t
-            angle += table[i]
-        else:
-            y += x >> i
-            x -= t
-            angle -= table[i]
-        i += 1
-    s[_E] = angle
-    # x is 1.64676 times the length
-    t = x >> 15
-    s[_NOW] = t * 19898 + ((x - (t << 15)) * 19898 >> 15) >> shift
-
-
-@micropython.viper
-def field(s: ptr32, counts: ptr16):
+def smooth_field(s: ptr32, counts: ptr16):
     """Smooth the field (horizontal and vertical part) and compare: near the reference, near the candidate, turning."""
     k = 0
     if s[_PROBE] > 0:
         k = 32
-    j = s[_J_MAG]
+    j = s[_J]
     have = s[_HAVE]
     gain = (j << 24) // ((j << 10) + s[_SMOOTH])  # Q14
     i = 0
@@ -550,7 +385,7 @@ def field(s: ptr32, counts: ptr16):
         i += 1
     if m >= s[_TURNING_MIN]:
         bits |= _TURNING
-    x = s[_E] << k >> k
+    x = s[_HEADING] << k >> k
     if x < s[_AGREE] and x > 0 - s[_AGREE]:
         bits |= _AGREES
     m = _NEAR_REFERENCE | _NEAR_CANDIDATE | _TURNING | _AGREES
@@ -558,7 +393,7 @@ def field(s: ptr32, counts: ptr16):
 
 
 @micropython.viper
-def judge(s: ptr32):
+def judge_field(s: ptr32):
     """WEIGHT: whether the field is that of the reference, which follows slowly.
 
     A field that stays the same while the body turns becomes the reference, if its heading agrees with the gyro's.
@@ -566,7 +401,7 @@ def judge(s: ptr32):
     k = 0
     if s[_PROBE] > 0:
         k = 32
-    j = s[_J_MAG]
+    j = s[_J]
     bits = s[_DECIDED]
     have = s[_HAVE]
     gain = (j << 26) // ((j << 10) + s[_REF] >> 4)  # Q20
@@ -641,19 +476,19 @@ def steer(s: ptr32):
         u += (x * x >> 16) * (s[_II + i] >> 4)
         i += 1
     u >>= 2
-    j = s[_J_MAG]
+    j = s[_J]
     w = s[_WEIGHT]
     doubt = s[_DOUBT]
     s[_PUSH] = 0
     s[_ZK] = 0
     if j == 0 or w == 0:
         doubt += (u >> 14) * s[_DOUBT_RATE] >> 6
-        if doubt > PI28:
-            doubt = PI28
+        if doubt > _PI28:
+            doubt = _PI28
         s[_DOUBT] = doubt
-        s[_J_MAG] = 0
+        s[_J] = 0
         return
-    e = s[_E] << k >> k
+    e = s[_HEADING] << k >> k
     a = e
     if a < 0:
         a = 0 - a
@@ -710,7 +545,7 @@ def steer(s: ptr32):
         e = 0x8000000
     elif e < 0 - 0x8000000:
         e = 0 - 0x8000000
-    s[_CE + 2] = e << 2
+    s[_TURN + 2] = e << 2
     s[_DOUBT] = doubt + (((a - doubt) >> 14) * (i >> 7) >> 1)
 
 
@@ -733,10 +568,10 @@ def inform(s: ptr32):
         n += 1
     gain = s[_CC]
     shift = s[_CC_SHIFT]
-    most = s[_CE_MAX]
+    most = s[_TURN_MAX]
     n = 0
     while n < 2:
-        x = s[_CE + n] << k >> k
+        x = s[_TURN + n] << k >> k
         if x > most:
             x = most
         elif x < 0 - most:
@@ -759,13 +594,13 @@ def inform(s: ptr32):
     gain = s[_HC]
     s[_C + 2] = m * gain + ((x - (m << 8)) * gain >> 8) >> s[_HC_SHIFT]
     still = s[_STILL] == s[_REST_AFTER]
-    j = s[_J_MAG]
+    j = s[_J]
     om = s[_OM]
     n = 0
     while n < 3:
-        x = s[_J + n]
-        if x > s[_J_LEAST]:
-            m = (x >> 10) * s[_J_DECAY] >> 14
+        x = s[_INFO + n]
+        if x > s[_INFO_LEAST]:
+            m = (x >> 10) * s[_INFO_DECAY] >> 14
             x -= m * m >> 10
         u = 0
         if still:
@@ -784,7 +619,7 @@ def inform(s: ptr32):
             m = s[_C + 2] << k >> k
             m = (z * (m >> 12) + (z * (m & 4095) >> 12)) * j
             u += (m >> 9) * 3277 + ((m & 511) * 3277 >> 9) >> 6
-        s[_J + n] = x
+        s[_INFO + n] = x
         s[_U + n] = u
         n += 1
 
@@ -801,7 +636,7 @@ def learn(s: ptr32):
     rest = s[_GR]
     n = 0
     while n < 3:
-        m = s[_J + n]
+        m = s[_INFO + n]
         shift = 30 - b_shift
         x = 30
         while m < 0x20000000:

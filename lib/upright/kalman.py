@@ -24,19 +24,18 @@ _TURN = const(9)  # units a turn, 0: does not wrap
 
 _RANGE = const(1 << 29)
 
-# the attitude filter's: those of the kernels and of Euler6 that are used here ...
-_PROBE = const(0)
-_S = const(14)
-_E = const(25)
-_K = const(27)
-_K_SHIFT = const(28)
-_G = const(29)
-_GR = const(30)
-_B = const(34)
-_BR = const(37)
-_O = const(40)
-_OR = const(43)
-# ... and its own
+# -- words of the state: written by tools/upright_host/words.py
+_PROBE = const(0)  # always -1, see fixmath.py
+_S = const(14)  # 3, Q29: their sines
+_E = const(25)  # 2: roll and pitch error of this step: accelerometer less gyro
+_K = const(27)  # the part of the error that is taken up: K / 2**(K_SHIFT + 14)
+_K_SHIFT = const(28)  # 0..16
+_G = const(29)  # angle per step of one gyro count
+_GR = const(30)  # its last 15 bits, 0..32767
+_B = const(34)  # 3: gyro bias that is set, angle per step
+_BR = const(37)  # 3: its last 15 bits, 0..32767
+_O = const(40)  # 3: what is added to the gyro: less the bias, set and learnt
+_OR = const(43)  # 3: its last 15 bits, -65534..0
 _I = const(46)  # 3: bias that was learnt, angle per step, 2**-(30 + I_SHIFT) turn
 _IR = const(49)  # 3: its remainder, K2_SHIFT bits
 _V = const(52)  # 3: the error as a turn of the body, its sign that of the gyro's bias
@@ -45,6 +44,7 @@ _K2_SHIFT = const(56)  # 1..29
 _I_SHIFT = const(57)  # 0..15
 _I_MAX = const(58)  # bound of |I|, below 2**30
 _WORDS = const(59)
+# -- end of the words
 
 _LEAST_MANTISSA = const(64)  # a gain is held to better than 1 %
 ONE = 1 << 100  # set-up computes gains with 100 bits behind the point
@@ -99,17 +99,17 @@ class KalmanFilter:
             x = (x + (turn >> 1)) % turn - (turn >> 1)
         self.Q = Q
         self.R = R
-        self._s = array(
+        self.state = array(
             "i", [-1, 1 << 29, 0, ratio >> 20, ratio & 0xFFFFF, shift, 0, x, 1 << 28, turn]
         )
 
     @micropython.viper
     def update(self, z: int) -> int:
         """Take the measurement z, an int within +-2**29; returns the estimate, from -turn/2 to below turn/2."""
-        state = self._s
+        state = self.state
         s = ptr32(state)
         if s[_SETTLED] == 0:
-            settle(state)
+            settle_gain(state)
         k = 0
         if s[_PROBE] > 0:
             k = 32
@@ -135,15 +135,15 @@ class KalmanFilter:
 
     @property
     def x(self):
-        return self._s[_VALUE]
+        return self.state[_VALUE]
 
     @property
     def gain(self):
-        return self._s[_GAIN]
+        return self.state[_GAIN]
 
     @property
     def K(self):
-        return (self._s[_GAIN] * (1 << 20) + self._s[_GAIN_REST]) / (1 << 49)
+        return (self.state[_GAIN] * (1 << 20) + self.state[_GAIN_REST]) / (1 << 49)
 
     @property
     def P(self):
@@ -151,7 +151,7 @@ class KalmanFilter:
 
 
 @micropython.viper
-def settle(s: ptr32):
+def settle_gain(s: ptr32):
     """One step of the scalar filter's gain: K = d / (1 + d) with d = K + Q/R, by long division, 49 bits.
 
     With K = 1e-5 a step changes it by 1e-10 of itself at most, so it takes these bits to arrive. Once it has not
@@ -221,8 +221,6 @@ class Kalman6(Euler6):
 
     NAME = "kalman6"
 
-    _size = _WORDS
-
     def __init__(
         self,
         rate,
@@ -233,8 +231,8 @@ class Kalman6(Euler6):
         r_angle=20,
         bias_limit_dps=20,
     ):
-        limit = self._set_up(rate, gyro_scale, accel_lsb_per_g, bias_limit_dps)
-        s = self._s
+        limit = self.prepare(rate, gyro_scale, accel_lsb_per_g, _WORDS, bias_limit_dps)
+        s = self.state
         k1, k2 = steady_gains(self.rate, q_angle, q_bias, r_angle)
         pair = fixmath.mantissa(k1, ONE, 14, 30)
         # as fine as the limit (2**-45 turn) and the gain allow
@@ -269,26 +267,23 @@ class Kalman6(Euler6):
         s[_K2] = bias_pair[0]
         s[_K2_SHIFT] = bias_pair[1] - 14
 
-    def set_bias(self, x, y, z):
-        """Set the gyro's bias, ints in 1/256 of a gyro count; what is learnt from now on comes on top of it.
-
-        Raises ValueError beyond +-8192 counts.
-        """
-        Euler6.set_bias(self, x, y, z)
+    def set_bias(self, x, y, z, known_s=0):
+        """Euler6.set_bias; what is learnt from now on comes on top of it."""
+        Euler6.set_bias(self, x, y, z, known_s)
         for i in range(3):
-            self._s[_I + i] = self._s[_IR + i] = 0
+            self.state[_I + i] = self.state[_IR + i] = 0
 
     def bias(self, out):
         """The gyro's bias, set and learnt, in 1/256 of a gyro count: out[0..2]. For the main loop: it may allocate."""
-        s = self._s
+        s = self.state
         gain = (s[_G] << 15) + s[_GR]
         for i in range(3):
-            out[i] = self._bias[i] + fixmath.ratio(s[_I + i] << 23, gain << s[_I_SHIFT])
+            out[i] = self.bias_set[i] + fixmath.ratio(s[_I + i] << 23, gain << s[_I_SHIFT])
 
     def bias_mdps(self, out):
         """The gyro's bias, set and learnt, in millidegrees/s: out[0..2]. For the main loop: it may allocate."""
         Euler6.bias_mdps(self, out)
-        s = self._s
+        s = self.state
         num, den = self.rate
         for i in range(3):
             out[i] += fixmath.ratio(s[_I + i] * 360000 * num, den << (30 + s[_I_SHIFT]))
@@ -296,7 +291,7 @@ class Kalman6(Euler6):
     @property
     def gains(self):
         """The gains that are held, as floats for hosts: angle per angle, and bias per angle in 1/s."""
-        s = self._s
+        s = self.state
         num, den = self.rate
         k2 = s[_K2] / (1 << (s[_K2_SHIFT] + 14 + s[_I_SHIFT]))
         return s[_K] / (1 << (s[_K_SHIFT] + 14)), k2 * num / den
@@ -308,13 +303,13 @@ class Kalman6(Euler6):
         The accelerometer is left out, and the bias stands still, when flags (word 10) has bit 0 clear (no fresh sample:
         the last gyro words go on) or bit 2 set (accelerometer at full scale), and below 1/16 g.
         """
-        state = self._s
+        state = self.state
         if int(step(state, counts)):
-            learn(state)
+            learn_bias(state)
 
 
 @micropython.viper
-def learn(s: ptr32):
+def learn_bias(s: ptr32):
     """Take the errors E of a Kalman6's step into its bias."""
     k = 0
     if s[_PROBE] > 0:

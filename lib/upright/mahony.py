@@ -4,8 +4,6 @@
 # nothing, raises nothing, uses no float, and gives the same bits on every port. docs/numerics.md
 # has the bounds.
 
-from array import array
-
 import micropython
 from micropython import const
 
@@ -13,23 +11,22 @@ from upright import fixmath
 from upright.attitude import Attitude, bias_of, hertz
 from upright.fixmath import north, tilt, turn
 
-# the words of fixmath's kernels that are used here ...
-_PROBE = const(0)
-_Q = const(1)
-_QR = const(5)
-_W = const(9)
-_WR = const(12)
-_E = const(22)
-_LOW = const(25)
-# ... and the filter's own
+# -- words of the state: written by tools/upright_host/words.py
+_PROBE = const(0)  # always -1: ptr32 zero-extends on 64-bit ports, see fixmath.py
+_Q = const(1)  # 4, Q29: quaternion w x y z, body to earth
+_QR = const(5)  # 4, Q44: what rounding has left of it, 0..32767
+_W = const(9)  # 3, Q31: half the angle of this step, rad
+_WR = const(12)  # 3, Q46: what rounding has left of it, 0..32767
+_E = const(22)  # 3, Q29: the attitude error as a rotation vector in the body; see fixmath.north
+_LOW = const(25)  # least squared length / 4 of the accelerometer's counts that is used, 4..2**28
 _I = const(26)  # 3: integral of the feedback, half angle per step, Q(31 + I_SHIFT)
 _IR = const(29)  # 3: its remainder, KI_SHIFT bits
-_B = const(32)  # 3: gyro bias, half angle per step, Q31
-_BR = const(35)  # 3: its last bits, 2**-46, 0..32767
-_O = const(38)  # 3: integral - bias, half angle per step, Q31
-_OR = const(41)  # 3: its last bits, 2**-46, -32767..32767
-_G = const(44)  # half angle per step of one gyro count, Q31 ...
-_GR = const(45)  # ... and its last bits, 2**-46, 0..32767
+_B = const(32)  # 3, Q31: gyro bias, half angle per step
+_BR = const(35)  # 3, Q46: its last bits, 0..32767
+_O = const(38)  # 3, Q31: integral - bias, half angle per step
+_OR = const(41)  # 3, Q46: its last bits, -32767..32767
+_G = const(44)  # Q31: half angle per step of one gyro count
+_GR = const(45)  # Q46: its last bits, 0..32767
 _KP = const(46)  # 2 kp dt = KP / 2**(KP_SHIFT + 14): E (Q29) to half angle (Q31)
 _KP_SHIFT = const(47)  # 0..16
 _KI = const(48)  # ki dt**2 2**(I_SHIFT + 1) = KI / 2**(KI_SHIFT + 14)
@@ -37,8 +34,9 @@ _KI_SHIFT = const(49)  # 1..29
 _I_SHIFT = const(50)  # 0..15
 _I_MAX = const(51)  # bound of |I|, below 2**30
 _MAG_MOST = const(52)  # a magnetometer sample stands for at most so many steps, 1..253; 0: six axes
-_MAG_AGE = const(53)  # steps since one was used, 0.._NEVER
+_MAG_AGE = const(53)  # steps since one was used, 0..2**30 - 1
 _WORDS = const(54)
+# -- end of the words
 
 _W_MAX = const((1 << 31) - (1 << 16))  # 1 rad in Q31, less what fixmath.turn adds for rounding
 _LEAST_MANTISSA = const(64)  # a gain is held to better than 1 %
@@ -79,8 +77,8 @@ class Mahony6(Attitude):
     AXES = 6
 
     def __init__(self, rate, gyro_scale, accel_lsb_per_g, kp=0.5, ki=0.0, bias_limit_dps=20):
-        s = self._begin(rate, gyro_scale, accel_lsb_per_g, _WORDS)
-        self._bias = array("i", [0, 0, 0])  # 1/256 counts
+        Attitude.__init__(self, rate, gyro_scale, accel_lsb_per_g, _WORDS)
+        s = self.state
         s[_Q] = fixmath.ONE
         s[_LOW] = accel_lsb_per_g * accel_lsb_per_g >> 10  # (1/16 g)**2 / 4
         s[_MAG_AGE] = _NEVER
@@ -95,30 +93,31 @@ class Mahony6(Attitude):
         identity. The bias and the integral stay. update() is to be given the same sample next.
         """
         x, y, z = counts[0], counts[1], counts[2]
-        if (x * x >> 2) + (y * y >> 2) + (z * z >> 2) < self._s[_LOW]:
-            self._attitude((fixmath.ONE, 0, 0, 0))
+        if (x * x >> 2) + (y * y >> 2) + (z * z >> 2) < self.state[_LOW]:
+            self.start_at((fixmath.ONE, 0, 0, 0))
             return False
-        self._attitude(fixmath.level(x, y, z))
+        self.start_at(fixmath.attitude_from_up(x, y, z))
         return True
 
-    def _attitude(self, q):
+    def start_at(self, q):
         for i in range(4):
-            self._s[_Q + i] = q[i]
-            self._s[_QR + i] = 16384
+            self.state[_Q + i] = q[i]
+            self.state[_QR + i] = 16384
         for i in range(3):
-            self._s[_WR + i] = 16384
+            self.state[_WR + i] = 16384
 
-    def set_bias(self, x, y, z):
+    def set_bias(self, x, y, z, known_s=0):
         """Set the gyro's bias, ints in 1/256 of a gyro count; it is subtracted from every sample.
 
         The integral of the feedback is kept apart from it (it is added to the rate) and starts
-        again from 0. Raises ValueError beyond +-8192 counts.
+        again from 0; known_s, how well the bias is known, changes nothing here. Raises ValueError
+        beyond +-8192 counts, and for a known_s that is none.
         """
-        bias = bias_of(x, y, z)
-        s = self._s
+        bias = bias_of(x, y, z, known_s)
+        s = self.state
         gain = (s[_G] << 15) + s[_GR]
         for i in range(3):
-            self._bias[i] = bias[i]
+            self.bias_set[i] = bias[i]
             b = fixmath.ratio(bias[i] * gain, 256)
             s[_B + i] = b >> 15
             s[_BR + i] = b & 32767
@@ -126,27 +125,23 @@ class Mahony6(Attitude):
             s[_O + i] = -s[_B + i]
             s[_OR + i] = -s[_BR + i]
 
-    def bias(self, out):
-        """The bias that is set, in 1/256 of a gyro count: out[0..2]."""
-        for i in range(3):
-            out[i] = self._bias[i]
-
     def bias_mdps(self, out):
         """What the filter takes for the gyro's bias, in millidegrees/s: the bias set less the integral.
 
         out: array('i') of 3 words. For the main loop: it may allocate.
         """
-        num, den = self.gyro_scale
-        self.integral_mdps(out)
+        integral = [0, 0, 0]
+        self.integral_mdps(integral)
+        Attitude.bias_mdps(self, out)
         for i in range(3):
-            out[i] = fixmath.ratio(self._bias[i] * 1000 * den, 256 * num) - out[i]
+            out[i] -= integral[i]
 
     def integral_mdps(self, out):
         """The integral of the feedback, which is added to the rate, in millidegrees/s: out[0..2].
 
         For the main loop: it may allocate.
         """
-        s = self._s
+        s = self.state
         num, den = self.rate
         for i in range(3):
             out[i] = fixmath.ratio(
@@ -164,7 +159,7 @@ class Mahony6(Attitude):
         then stands still and goes on being applied. The magnetometer, where there is one, does not
         depend on the accelerometer: it is used with the bits 0 and 1 set.
         """
-        state = self._s
+        state = self.state
         tilt(state, counts)  # E
         # W = (gyro - bias + kp E + integral) dt/2, after the integral has taken up E. This stands here and not in
         # a kernel of its own: to call one costs as much as to do a third of its work.
@@ -284,15 +279,15 @@ class Mahony9(Mahony6):
             # |up x field|**2
             across = _dot(up, up) * length - _dot(up, field) ** 2
             if across * _SEED_SINE**2 >= _dot(up, up) * length:
-                self._attitude(fixmath.level_north(up, field))
-                self._s[_MAG_AGE] = 0
+                self.start_at(fixmath.attitude_from_up_and_north(up, field))
+                self.state[_MAG_AGE] = 0
                 self.heading_seeded = True
         return True
 
     @property
     def mag_age(self):
         """Steps since the magnetometer was used last; 0 when the last step did, 2**30 - 1 if none ever has."""
-        return self._s[_MAG_AGE]
+        return self.state[_MAG_AGE]
 
 
 # ----------------------------------------------------------------------------- set-up: allocates

@@ -1,128 +1,110 @@
 # The multiplicative quaternion Kalman filter in 32-bit integers: sensor counts in, quaternion out, with the gyro's bias
-# and with variances that say how well all of it is known. Needs attitude.py, fixmath.py, quaternion_kernels.py and the
-# viper emitter. update() is made for a hard interrupt: it allocates nothing, raises nothing, uses no float, and gives
-# the same bits on every port.
+# and with variances that say how well all of it is known. Needs attitude.py, fixmath.py, earth_kernels.py,
+# quaternion_kernels.py and the viper emitter. update() is made for a hard interrupt: it allocates nothing, raises
+# nothing, uses no float, and gives the same bits on every port.
 
 import micropython
 from micropython import const
 
-from upright import fixmath, quaternion_kernels
-from upright.attitude import Attitude, bias_of, hertz
-from upright.fixmath import turn
+from upright import fixmath
+from upright.earth_kernels import MILLION, EarthFilter, advance, compass, fine_mantissa
 from upright.quaternion_kernels import (
-    carry,
-    close,
-    compass,
-    field,
-    gain,
-    gather,
-    level,
-    noise,
-    open_up,
-    rest,
-    run,
-    settle,
-    shrink,
-    spread,
-    steer,
-    swell,
-    tilted,
+    add_noise,
+    after_tilt,
+    carry_errors,
+    find_gains,
+    forget,
+    measure_rest,
+    ready_for_heading,
+    shrink_covariance,
+    spread_attitude,
+    spread_bias,
+    spread_velocity,
+    take_sums,
+    tilt_from_accel,
+    weigh_field,
 )
 
-# the words of the state that are used here: see quaternion_kernels.py
+# -- words of the state: written by tools/upright_host/words.py
 _PROBE = const(0)
-_Q = const(1)
-_QR = const(5)
-_W = const(9)
-_WR = const(12)
-_G = const(15)
-_GR = const(16)
-_O = const(17)
-_OR = const(20)
-_F = const(23)
-_R = const(26)
-_HS = const(35)
-_GS = const(41)
-_BLOCK = const(49)
-_DECIDED = const(52)
-_X = const(77)
-_V = const(85)
-_B = const(87)
-_P = const(90)
-_UH = const(162)
-_UE = const(163)
-_UR = const(164)
-_UM = const(165)
-_OVER = const(166)
-_MEANT = const(249)
-_YOUNG = const(251)
-_AFTER = const(252)
-_HG = const(168)
-_HG_SHIFT = const(169)
-_C = const(170)
-_B_SHIFT = const(171)
-_B_MOST = const(172)
-_QT = const(173)
-_QB = const(175)
-_QS = const(177)
-_QS_SHIFT = const(178)
-_BS = const(179)
-_RV = const(180)
-_RM = const(181)
-_RA = const(183)
-_V0 = const(184)
-_LOW1 = const(185)
-_LOW2 = const(191)
-_BASE = const(197)
-_O_BASE = const(200)
-_OR_BASE = const(203)
-_Z = const(206)
-_STILL = const(210)
-_REST_AFTER = const(211)
-_REST_K = const(212)
-_REST_GYRO = const(213)
-_REST_ACCEL = const(214)
-_REST_MOST = const(215)
-_REST_OFF = const(216)
-_KNOWN = const(217)
-_CB = const(218)
-_CB_SHIFT = const(219)
-_WIDE_FOR = const(221)
-_WIDE_MOST = const(222)
-_LOST = const(223)
-_LOST_MOST = const(224)
-_SINCE = const(225)
-_J = const(226)
-_FAR = const(237)
-_FIELD_AFTER = const(238)
-_TOL = const(240)
-_SMOOTH = const(241)
-_TAU = const(242)
-_TAU_FAR = const(243)
-_FAR_MOST = const(244)
-_GOOD = const(245)
-_FIRST = const(246)
-_TAU_0 = const(248)
-_STAGE = const(53)  # the next piece of the block's work, 0..8
-_PER = const(54)  # pieces in a step
-_PHASE = const(48)  # fresh steps of the block
-_MASK = const(50)  # steps of a block less 1
-_NINE = const(51)  # 1: use the magnetometer
-_RR = const(182)  # variance / 16 of the bias at rest
-_AXIS = const(220)  # that is measured at rest
+_B = const(32)
+_FORCE = const(47)
+_NINE = const(50)
+_BLOCK = const(51)
+_BLOCK_MASK = const(52)
+_PHASE = const(53)
+_DECIDED = const(54)
+_GS = const(55)
+_SINCE = const(62)
+_J = const(63)
+_STILL = const(88)
+_REST_AFTER = const(89)
+_REST_MOST = const(93)
+_HS = const(94)
+_AS = const(97)
+_STAGE = const(100)
+_PER = const(101)
+_ML = const(120)
+_X = const(124)
+_V = const(132)
+_P = const(134)
+_UH = const(206)
+_UE = const(207)
+_UR = const(208)
+_UM = const(209)
+_OVER = const(210)
+_MEANT = const(211)
+_HG = const(213)
+_HG_SHIFT = const(214)
+_C = const(215)
+_B_SHIFT = const(216)
+_B_MOST = const(217)
+_QT = const(218)
+_QB = const(220)
+_QS = const(222)
+_QS_SHIFT = const(223)
+_BS = const(224)
+_RV = const(225)
+_RM = const(226)
+_RR = const(227)
+_RA = const(228)
+_V0 = const(229)
+_AXIS = const(230)
+_Z = const(231)
+_REST_OFF = const(234)
+_KNOWN = const(235)
+_CB = const(236)
+_CB_SHIFT = const(237)
+_WIDE_FOR = const(238)
+_WIDE_MOST = const(239)
+_LOST = const(240)
+_LOST_MOST = const(241)
+_FAR = const(249)
+_FIELD_AFTER = const(250)
+_TOL = const(251)
+_SMOOTH = const(252)
+_TAU = const(253)
+_TAU_FAR = const(254)
+_TAU_0 = const(255)
+_FAR_MOST = const(256)
+_GOOD = const(257)
+_FIRST = const(258)
+_YOUNG = const(260)
+_AFTER = const(261)
+_WORDS = const(262)
+# -- end of the words
 
+_PI28 = const(105414357 << 3)  # quaternion_kernels' pi, Q25
 _OPEN = const(603979776)  # quaternion_kernels.OPEN
 _WIDE = const(8)
 _RUNAWAY = const(16)
 _UPSET = const(128)
 _NOT_BY_MAG = const(0xC3)  # tilt and velocity
 _BIAS = const(0x38)
-_W_MAX = const((1 << 31) - (1 << 16))  # 1 rad in Q31, less what fixmath.turn adds for rounding
 _FOLD_W = const(651000000)  # half of sqrt(3) 0.35 rad, Q31
 _SEEDED = const(47099587)  # (12 deg)**2, Q30: of an attitude from one sample
 _HEADING_START = const(8177247)  # (5 deg)**2: of a heading that is relative
 _SIGMA = const(26000)  # first sigma of the bias in P's units, no more
-_MILLION = const(1000000)
 
 
 @micropython.viper
@@ -130,28 +112,28 @@ def work(state, n: int):
     """Piece n of a block's work, 0..7; it is done while the next block is measured."""
     s = ptr32(state)
     if n == 0:
-        close(state)
-        carry(state)
+        take_sums(state)
+        carry_errors(state)
     elif n == 1:
-        spread(state)
+        spread_bias(state)
         if s[_NINE]:
-            compass(state)
+            compass(state, _ML, _PI28)
     elif n == 2:
-        swell(state)
-        run(state)
-        noise(state)
+        spread_attitude(state)
+        spread_velocity(state)
+        add_noise(state)
     elif n == 3:
         if s[_YOUNG]:
             s[_YOUNG] -= 1
-        rest(state)
+        measure_rest(state)
         if s[_DECIDED] & _UPSET:
-            open_up(state, 0, _OPEN)
-            open_up(state, 1, _OPEN)
+            forget(state, 0, _OPEN)
+            forget(state, 1, _OPEN)
         if s[_NINE]:
             if s[_WIDE_FOR]:
                 s[_J] = 0  # no heading without the vertical
             elif s[_J]:
-                field(state)
+                weigh_field(state)
     elif n == 7:
         i = s[_AXIS] + 1
         if i == 3:
@@ -162,23 +144,23 @@ def work(state, n: int):
             s[_UH] = 3 + i
             s[_UR] = s[_RR]
             s[_UM] = 0
-            gain(state)
-            shrink(state)
+            find_gains(state)
+            shrink_covariance(state)
     elif n == 6:
         if s[_NINE]:
-            i = int(steer(state))
+            i = int(ready_for_heading(state))
             if i:
                 if i > 1:
-                    open_up(state, 2, _OPEN)
+                    forget(state, 2, _OPEN)
                 s[_UH] = 2
                 s[_UM] = _NOT_BY_MAG
                 if s[_YOUNG]:
                     s[_UM] |= _BIAS
-                gain(state)
-                shrink(state)
+                find_gains(state)
+                shrink_covariance(state)
     else:
         if n == 4:
-            tilted(state)
+            tilt_from_accel(state)
         i = n - 4
         s[_UM] = 0
         if s[_YOUNG]:
@@ -191,24 +173,24 @@ def work(state, n: int):
             s[_UH] = 6 + i
             s[_UE] = 0 - s[_V + i]
             s[_UR] = s[_RV]
-        gain(state)
-        shrink(state)
+        find_gains(state)
+        shrink_covariance(state)
         m = s[_OVER]
         if n == 4:
             s[_DECIDED] = (s[_DECIDED] | _RUNAWAY) ^ _RUNAWAY
         if m:
             s[_DECIDED] |= _RUNAWAY
         if n == 5:
-            i = int(settle(state))
+            i = int(after_tilt(state))
             if i == 1:
-                open_up(state, 0, _OPEN)
-                open_up(state, 1, _OPEN)
+                forget(state, 0, _OPEN)
+                forget(state, 1, _OPEN)
             elif i == 2:
-                open_up(state, 6, s[_V0])
-                open_up(state, 7, s[_V0])
+                forget(state, 6, s[_V0])
+                forget(state, 7, s[_V0])
 
 
-class QuaternionKalman(Attitude):
+class QuaternionKalman9(EarthFilter):
     """Attitude and gyro bias from gyro, accelerometer and magnetometer: an error-state Kalman filter of 8 states.
 
     The attitude is the quaternion, turned by every gyro sample; the filter estimates its error as a small rotation
@@ -231,7 +213,6 @@ class QuaternionKalman(Attitude):
     rate              samples per second: int, or (num, den) for num/den Hz
     gyro_scale        (num, den): exact LSB per deg/s
     accel_lsb_per_g   int, 64..32767
-    axes              9, or 6: the magnetometer is ignored, heading is relative to the start
 
     All taken to six significant digits:
 
@@ -265,127 +246,75 @@ class QuaternionKalman(Attitude):
 
     NAME = "quaternion-kalman9"
     AXES = 9
+    PARAMETERS = {
+        "gyro_noise": (0.043, 0.001, 1),
+        "bias_walk": (0.0033, 0, 0.1),
+        "scale_error": (0.007, 0, 0.02),
+        "accel_noise": (0.1, 0.02, 1),
+        "velocity_noise": (1.1, 0.1, 2),
+        "mag_noise": (0.15, 0.01, 0.2),
+        "bias_start": (3.3, 0.5, 10),
+        "bias_after": (5, 0, 60),
+        "rest_noise": (0.03, 0.01, 1),
+        "rest_gyro_dps": (2, 0.1, 10),
+        "rest_accel_g": (0.05, 0.01, 0.1),
+        "rest_after": (1.5, 0.2, 10),
+        "field_tolerance": (0.2, 0.02, 0.7),
+    }
 
-    def __init__(self, rate, gyro_scale, accel_lsb_per_g, axes=9, **parameters):
-        if axes not in (6, 9):
-            raise ValueError("axes is %r, expected 6 or 9" % (axes,))
-        self.AXES = axes
-        self.NAME = "quaternion-kalman%d" % axes
-        s = self._begin(rate, gyro_scale, accel_lsb_per_g, quaternion_kernels.WORDS)
-        s[_NINE] = int(axes == 9)
-        _set_up(s, self.rate, self.gyro_scale, accel_lsb_per_g, parameters)
+    def __init__(self, rate, gyro_scale, accel_lsb_per_g, **parameters):
+        EarthFilter.__init__(
+            self, rate, gyro_scale, accel_lsb_per_g, _WORDS, _bias_most, _corrections, parameters
+        )
+        _set_up(self, parameters)
         self.set_bias(0, 0, 0)
-        self._attitude((fixmath.ONE, 0, 0, 0))
+        self.start_at((fixmath.ONE, 0, 0, 0))
 
     # -- set-up and main loop
-    def seed(self, counts):
-        """Take roll and pitch from one accelerometer sample, heading from the magnetometer's where flags bit 1 is set.
-
-        Without a magnetometer sample yaw is 0 (order zyx). Returns True, or False when the accelerometer is shorter
-        than 1/16 g: then the attitude is the identity. What has been learnt of bias and field stays. update() is to be
-        given the same sample next.
-        """
-        x, y, z = counts[0], counts[1], counts[2]
-        if (x * x + y * y + z * z) << 8 < self.accel_lsb_per_g**2:
-            self._attitude((fixmath.ONE, 0, 0, 0))
-            return False
-        i, j, k = counts[6], counts[7], counts[8]
-        heading = _SEEDED
-        if (
-            self.AXES == 9
-            and counts[10] & 2
-            and (y * k != z * j or z * i != x * k or x * j != y * i)
-        ):
-            q = fixmath.level_north((x, y, z), (i, j, k))
-        else:
-            q = fixmath.level(x, y, z)
-            heading = _OPEN
-        self._attitude(q, _SEEDED)
-        self._open(2, heading if self.AXES == 9 else _HEADING_START)
-        return True
-
-    def _attitude(self, q, variance=_OPEN):
-        s = self._s
-        for i in range(4):
-            s[_Q + i] = q[i]
-            s[_QR + i] = 16384
-        for i in range(3):
-            s[_WR + i] = 16384
-        for first, n in ((_F, 3), (_HS, 13), (_X, 8), (_V, 2)):
+    def start_at(self, q, known=0):
+        EarthFilter.start_at(self, q)
+        s = self.state
+        for first, n in ((_HS, 3), (_AS, 3), (_GS, 3), (_X, 8), (_V, 2)):
             for i in range(n):
                 s[first + i] = 0
-        for i in (_WIDE_FOR, _LOST, _SINCE, _J, _FAR):
+        for i in (_WIDE_FOR, _LOST, _FAR):
             s[i] = 0
         s[_YOUNG] = s[_AFTER]
         s[_STAGE] = 8  # the block that was being worked on is of the old attitude
         s[_PHASE] = 1
-        self._open(0, variance)
-        self._open(1, variance)
-        self._open(2, variance if s[_NINE] else _HEADING_START)
+        tilt = _SEEDED if known else _OPEN
+        self._open(0, tilt)
+        self._open(1, tilt)
+        self._open(2, (_SEEDED if known == 2 else _OPEN) if s[_NINE] else _HEADING_START)
         self._open(6, s[_V0])
         self._open(7, s[_V0])
 
     def _open(self, i, variance):
-        """open_up, for variances of more than 30 bits."""
-        open_up(self._s, i, 0)
-        self._s[_P + (0, 8, 15, 21, 26, 30, 33, 35)[i]] = variance
+        """forget, for variances of more than 30 bits."""
+        forget(self.state, i, 0)
+        self.state[_P + (0, 8, 15, 21, 26, 30, 33, 35)[i]] = variance
 
-    def set_bias(self, x, y, z):
-        """Set the gyro's bias, ints in 1/256 of a gyro count; what the filter learns from now on comes on top of it.
-
-        Raises ValueError beyond +-8192 counts.
-        """
-        bias = bias_of(x, y, z)
-        s = self._s
-        step = (s[_G] << 15) + s[_GR]
+    def bias_is_new(self, known_s):
         for i in range(3):
-            b = fixmath.ratio(bias[i] * step, 256)
-            change = (s[_BASE + i] - bias[i]) << 4
-            s[_LOW1 + 3 + i] += change
-            s[_LOW2 + 3 + i] += change
-            s[_BASE + i] = bias[i]
-            s[_O + i] = s[_O_BASE + i] = -(b >> 15)
-            s[_OR + i] = s[_OR_BASE + i] = -(b & 32767)
-            s[_B + i] = 0
-            self._open(3 + i, s[_BS])
-
-    def bias(self, out):
-        """The gyro's bias, set and learnt, in 1/256 of a gyro count: out[0..2]. For the main loop."""
-        num, den = self._counts
-        for i in range(3):
-            out[i] = self._s[_BASE + i] + fixmath.ratio(self._s[_B + i] * num << 8, den)
-
-    def bias_mdps(self, out):
-        """The gyro's bias, set and learnt, in millidegrees/s: out[0..2]. For the main loop: it may allocate."""
-        scale, per = self.gyro_scale
-        num, den = self._counts
-        for i in range(3):
-            b = self._s[_BASE + i] * den + (self._s[_B + i] * num << 8)
-            out[i] = fixmath.ratio(b * 1000 * per, 256 * den * scale)
+            self._open(3 + i, self.state[_BS])
 
     @property
-    def _counts(self):
-        """(num, den): gyro counts of one unit of a bias."""
+    def bias_unit(self):
         num, den = self.rate
         scale, per = self.gyro_scale
-        unit = 1 << (self._s[_C] + 25 + self._s[_BLOCK])
+        unit = 1 << (self.state[_C] + 25 + self.state[_BLOCK])
         return 180 * fixmath.PI_DEN * num * scale, unit * fixmath.PI_NUM * den * per
-
-    @property
-    def resting(self):
-        """True while the body is taken to be at rest: then the gyro measures its own bias."""
-        return self._s[_STILL] == self._s[_REST_AFTER]
 
     @property
     def mag_accepted(self):
         """True while the magnetometer measures the heading; False when its field is rejected, or there is none."""
-        s = self._s
+        s = self.state
         return s[_GOOD] > 0 and s[_SINCE] < 16 and s[_WIDE_FOR] == 0
 
     @property
     def tilt_uncertainty_mdeg(self):
         """Sigma of the tilt about the worse horizontal axis, in millidegrees. For the main loop: it may allocate."""
-        return _mdeg(max(self._s[_P], self._s[_P + 8]))
+        return _mdeg(max(self.state[_P], self.state[_P + 8]))
 
     @property
     def heading_uncertainty_mdeg(self):
@@ -393,7 +322,7 @@ class QuaternionKalman(Attitude):
 
         For the main loop: it may allocate.
         """
-        return _mdeg(self._s[_P + 15])
+        return _mdeg(self.state[_P + 15])
 
     # -- tick
     @micropython.viper
@@ -404,106 +333,49 @@ class QuaternionKalman(Attitude):
         clock of all that is estimated stands still. Bit 1: the magnetometer's words are fresh; any rate down to a tenth
         of the steps' will do. Bits 2 and 3 (full scale) change nothing: to leave such samples out would be worse.
         """
-        state = self._s
+        state = self.state
+        advance(state, counts)
         s = ptr32(state)
         c = ptr16(counts)
-        k = 0
-        if s[_PROBE] > 0:
-            k = 32
-        step = s[_G]
-        fine = s[_GR]
-        n = ((c[3] & 0xFFFF) ^ 0x8000) - 0x8000
-        x = (s[_O] << k >> k) + n * step
-        u = (s[_OR] << k >> k) + n * fine + s[_WR]
-        m = ((c[4] & 0xFFFF) ^ 0x8000) - 0x8000
-        y = (s[_O + 1] << k >> k) + m * step
-        v = (s[_OR + 1] << k >> k) + m * fine + s[_WR + 1]
-        o = ((c[5] & 0xFFFF) ^ 0x8000) - 0x8000
-        z = (s[_O + 2] << k >> k) + o * step
-        w = (s[_OR + 2] << k >> k) + o * fine + s[_WR + 2]
-        fresh = c[10] & 1
-        if fresh:
-            s[_GS] = (s[_GS] << k >> k) + n
-            s[_GS + 1] = (s[_GS + 1] << k >> k) + m
-            s[_GS + 2] = (s[_GS + 2] << k >> k) + o
-            if s[_PHASE] == 1:
-                # the first step of a block: the last one's correction, from the earth into the body
-                i = 0
-                while i < 3:
-                    n = s[_F + i] << k >> k
-                    s[_F + i] = 0
-                    m = (n + 16384) >> 15
-                    n -= m << 15
-                    o = s[_R + 3 * i] << k >> k
-                    x += o * m + (o * n + 16384 >> 15)
-                    o = s[_R + 3 * i + 1] << k >> k
-                    y += o * m + (o * n + 16384 >> 15)
-                    o = s[_R + 3 * i + 2] << k >> k
-                    z += o * m + (o * n + 16384 >> 15)
-                    i += 1
-        s[_WR] = u & 32767
-        s[_W] = x + (u >> 15)
-        s[_WR + 1] = v & 32767
-        s[_W + 1] = y + (v >> 15)
-        s[_WR + 2] = w & 32767
-        s[_W + 2] = z + (w >> 15)
-        turn(state)
-        if fresh:
-            level(state, counts)
-            if c[10] & 2 and s[_NINE]:
-                gather(state, counts)
+        if c[10] & 1:
+            k = 0
+            if s[_PROBE] > 0:
+                k = 32
+            i = 0
+            while i < 3:
+                n = ((c[i] & 0xFFFF) ^ 0x8000) - 0x8000
+                s[_AS + i] = (s[_AS + i] << k >> k) + n
+                s[_HS + i] = (s[_HS + i] << k >> k) + ((s[_FORCE + i] << k >> k) + 32 >> 6)
+                i += 1
             n = s[_PHASE]
-            s[_PHASE] = (n + 1) & s[_MASK]
+            s[_PHASE] = (n + 1) & s[_BLOCK_MASK]
             if n == 0:
                 s[_STAGE] = 0
-            o = s[_PER]
+            i = s[_PER]
             n = s[_STAGE]
-            while o and n < 8:
+            while i and n < 8:
                 work(state, n)
                 n += 1
-                o -= 1
+                i -= 1
             s[_STAGE] = n
 
 
-# the registry's names
-class QuaternionKalman6(QuaternionKalman):
-    """QuaternionKalman without a magnetometer."""
+class QuaternionKalman6(QuaternionKalman9):
+    """QuaternionKalman9 without a magnetometer: the heading is relative to the start."""
 
     NAME = "quaternion-kalman6"
     AXES = 6
 
-    update = QuaternionKalman.update  # see attitude.py
-
-    def __init__(self, rate, gyro_scale, accel_lsb_per_g, **parameters):
-        QuaternionKalman.__init__(self, rate, gyro_scale, accel_lsb_per_g, 6, **parameters)
-
-
-class QuaternionKalman9(QuaternionKalman):
-    """QuaternionKalman with everything."""
-
-    update = QuaternionKalman.update  # see attitude.py
-
-    def __init__(self, rate, gyro_scale, accel_lsb_per_g, **parameters):
-        QuaternionKalman.__init__(self, rate, gyro_scale, accel_lsb_per_g, 9, **parameters)
+    update = QuaternionKalman9.update  # see attitude.py
 
 
 # ----------------------------------------------------------------------------- set-up: allocates
-# name: (default, least, most)
-PARAMETERS = {
-    "gyro_noise": (0.043, 0.001, 1),
-    "bias_walk": (0.0033, 0, 0.1),
-    "scale_error": (0.007, 0, 0.02),
-    "accel_noise": (0.1, 0.02, 1),
-    "velocity_noise": (1.1, 0.1, 2),
-    "mag_noise": (0.15, 0.01, 0.2),
-    "bias_start": (3.3, 0.5, 10),
-    "bias_after": (5, 0, 60),
-    "rest_noise": (0.03, 0.01, 1),
-    "rest_gyro_dps": (2, 0.1, 10),
-    "rest_accel_g": (0.05, 0.01, 0.1),
-    "rest_after": (1.5, 0.2, 10),
-    "field_tolerance": (0.2, 0.02, 0.7),
-}
+def _bias_most(p):
+    return 25 * MILLION
+
+
+def _corrections(p):
+    return _FOLD_W
 
 
 def _mdeg(variance):
@@ -511,50 +383,18 @@ def _mdeg(variance):
     return fixmath.ratio(fixmath.isqrt(variance << 20) * 57296, 1 << 25)
 
 
-def _mantissa(num, den, bits):
-    """(m, s) with num/den = m / 2**s and m of so many bits; s may not be negative."""
-    s = 0
-    while num and fixmath.ratio(num << (s + 1), den) < 1 << bits:
-        s += 1
-    return fixmath.ratio(num << s, den), s
+def _set_up(filter, given):
+    """Turn rate, scales and parameters into the state's words, in integers throughout; every variance below 2**30.
 
-
-def _block_of(num, den):
-    """log2 of the steps of a block: at least 4 steps, 22 to 44 ms."""
-    shift = 2
-    while num >= 45 * den << shift:
-        shift += 1
-    return shift
-
-
-def _set_up(s, rate, gyro_scale, lsb, parameters):
-    """Turn rate, scales and parameters into the state's words, in integers throughout.
-
-    Bounds: |W| < 1 rad with every axis of the gyro at full scale against a bias of 8192 counts and the largest
-    corrections; blocks of 22 to 80 ms; every variance below 2**30.
+    given: the parameters as they were given.
     """
-    p = {}
-    for name in PARAMETERS:
-        default, least, most = PARAMETERS[name]
-        value = parameters.get(name, default)
-        p[name] = fixmath.quantise(value, name)
-        if not fixmath.quantise(least, "") <= p[name] <= fixmath.quantise(most, ""):
-            raise ValueError("%s is %r, expected %r..%r" % (name, value, least, most))
-    for name in parameters:
-        if name not in p:
-            raise TypeError("no parameter %r; there are %s" % (name, ", ".join(sorted(p))))
-    ratio = fixmath.ratio
-    num, den = rate
-    scale, per = gyro_scale
-    shift = _block_of(num, den)
-    text = hertz(rate)
-    if shift > 5 or num < 50 * den:
-        raise ValueError("rate is %s, expected 50..1439 Hz" % text)
+    s, p, lsb = filter.state, filter.parameters, filter.accel_lsb_per_g
+    blocks, counts, ratio = filter.blocks, filter.counts, fixmath.ratio
+    num, den = filter.rate
+    scale, per = filter.gyro_scale
+    shift = s[_BLOCK]
     t = den << shift  # a block lasts t / num s
     rad, degrees = fixmath.PI_NUM, 180 * fixmath.PI_DEN  # a degree
-
-    def blocks(millionths, bits=0):
-        return ratio(millionths * num << bits, _MILLION * t)
 
     def squared(value, of, power, bits):
         """(value / of)**2 (t / num)**power in units of 2**-bits."""
@@ -562,82 +402,54 @@ def _set_up(s, rate, gyro_scale, lsb, parameters):
             return ratio((value * value << bits) * num**-power, of * of * t**-power)
         return ratio((value * value << bits) * t**power, of * of * num**power)
 
-    def counts(millionths, units):
-        """A rate in 1e-6 deg/s as gyro counts, times units."""
-        return ratio(millionths * units * scale, _MILLION * per)
-
-    step = ratio(fixmath.PI_NUM * den * per << 46, fixmath.PI_DEN * 360 * num * scale)
-    bias_most = counts(25 * _MILLION, 1)
-    turn_most = ((step * (32768 + 8192 + bias_most)) >> 15) * 17321 // 10000
-    if turn_most + _FOLD_W > _W_MAX or step < 1 << 17:
-        raise ValueError(
-            "rate is %s, expected %d..%d Hz at %d/%d LSB per deg/s: choose another rate or gyro range"
-            % (
-                text,
-                max(50, -(-turn_most * num // (den * (_W_MAX - _FOLD_W)))),
-                min(1439, (step * num // den) >> 17),
-                scale,
-                per,
-            )
-        )
-    if counts(p["rest_gyro_dps"], 1) > 2000:
-        raise ValueError("gyro_scale is %d/%d, too fine for rest_gyro_dps" % gyro_scale)
-    s[_G] = step >> 15
-    s[_GR] = step & 32767
     s[_STAGE] = 8
     s[_PER] = 2 if shift == 2 else 1
-    s[_BLOCK] = shift
-    s[_MASK] = (1 << shift) - 1
-    s[_PHASE] = 1  # the first block is a whole one
-    s[_HG], s[_HG_SHIFT] = _mantissa(1 << 11, lsb << shift, 14)
+    s[_HG], s[_HG_SHIFT] = fine_mantissa(1 << 11, lsb << shift, 14)
     if p["bias_walk"] * 20 > p["bias_start"]:
         raise ValueError(
-            "bias_walk is %r, expected no more than 1/20 of bias_start" % (parameters["bias_walk"],)
-            if "bias_walk" in parameters
-            else "bias_start is %r, expected at least 20 times bias_walk"
-            % (parameters["bias_start"],)
+            "bias_walk is %r, expected no more than 1/20 of bias_start" % (given["bias_walk"],)
+            if "bias_walk" in given
+            else "bias_start is %r, expected at least 20 times bias_walk" % (given["bias_start"],)
         )
     # the bias: 2**-c rad a block
     c = 16
-    while squared(p["bias_start"] * rad, _MILLION * degrees, 2, 2 * c + 2) <= _SIGMA**2:
+    while squared(p["bias_start"] * rad, MILLION * degrees, 2, 2 * c + 2) <= _SIGMA**2:
         c += 1
     s[_C] = c - 15
     s[_B_SHIFT] = c + shift - 20
-    s[_BS] = squared(p["bias_start"] * rad, _MILLION * degrees, 2, 2 * c)
+    s[_BS] = squared(p["bias_start"] * rad, MILLION * degrees, 2, 2 * c)
     most = p["bias_start"] * 5 * rad * t << (c + 9)  # 2.5 sigma
-    s[_B_MOST] = min((1 << 30) - 1, ratio(most, _MILLION * degrees * num))
+    s[_B_MOST] = min((1 << 30) - 1, ratio(most, MILLION * degrees * num))
     s[_AFTER] = blocks(p["bias_after"])
     # noise of a block
-    s[_QT] = squared(p["gyro_noise"] * rad, _MILLION * degrees, 1, 46)
-    s[_QB] = squared(p["bias_walk"] * rad, _MILLION * degrees, 3, 2 * c + 12)
+    s[_QT] = squared(p["gyro_noise"] * rad, MILLION * degrees, 1, 46)
+    s[_QB] = squared(p["bias_walk"] * rad, MILLION * degrees, 3, 2 * c + 12)
     value = p["scale_error"] * rad * per
-    s[_QS], s[_QS_SHIFT] = _mantissa(
-        (value * value << 34) * t, (_MILLION * degrees * scale) ** 2 * num, 15
+    s[_QS], s[_QS_SHIFT] = fine_mantissa(
+        (value * value << 34) * t, (MILLION * degrees * scale) ** 2 * num, 15
     )
     # variances of measurements, / 16
-    s[_RA] = squared(p["accel_noise"], _MILLION, 0, 26)
-    s[_RV] = squared(p["velocity_noise"] * 100000, _MILLION * 980665, -3, 16)
-    s[_RM] = squared(p["mag_noise"], _MILLION, -1, 26)
-    r = ratio(squared(p["rest_noise"] * rad, _MILLION * degrees, 1, 2 * c), 48)
+    s[_RA] = squared(p["accel_noise"], MILLION, 0, 26)
+    s[_RV] = squared(p["velocity_noise"] * 100000, MILLION * 980665, -3, 16)
+    s[_RM] = squared(p["mag_noise"], MILLION, -1, 26)
+    r = ratio(squared(p["rest_noise"] * rad, MILLION * degrees, 1, 2 * c), 48)
     s[_RR] = min(max(r, 256), 1 << 29)
     s[_V0] = squared(5, 100, -2, 20)
     # rest
-    s[_REST_K] = ratio(t << 17, num + 4 * t)  # T / (1/4 + T), Q15
-    s[_REST_AFTER] = max(1, blocks(p["rest_after"]))
-    s[_REST_GYRO] = counts(p["rest_gyro_dps"], 8) ** 2
-    s[_REST_ACCEL] = ratio(p["rest_accel_g"] * 8 * lsb, _MILLION) ** 2
     s[_REST_MOST] = counts(p["bias_start"] * 5 // 2, 4096)
     s[_REST_OFF] = ratio(rad * t << (c + 9), degrees * num)
     s[_KNOWN] = squared(rad, 10 * degrees, 2, 2 * c)
-    s[_CB], s[_CB_SHIFT] = _mantissa((rad * per * t) << (c + 10), (degrees * scale * num) << 12, 15)
+    s[_CB], s[_CB_SHIFT] = fine_mantissa(
+        (rad * per * t) << (c + 10), (degrees * scale * num) << 12, 15
+    )
     s[_WIDE_MOST] = max(1, blocks(400000))
-    s[_LOST_MOST] = blocks(_MILLION)
+    s[_LOST_MOST] = blocks(MILLION)
     # field
     s[_FIELD_AFTER] = max(1, blocks(300000))
-    s[_TOL] = ratio(p["field_tolerance"] ** 2 << 14, _MILLION**2)
+    s[_TOL] = ratio(p["field_tolerance"] ** 2 << 14, MILLION**2)
     s[_SMOOTH] = blocks(50000, 10)
-    s[_TAU] = blocks(20 * _MILLION, 10)
-    s[_TAU_FAR] = blocks(100 * _MILLION, 10)
+    s[_TAU] = blocks(20 * MILLION, 10)
+    s[_TAU_FAR] = blocks(100 * MILLION, 10)
     s[_TAU_0] = blocks(200000, 10)
-    s[_FAR_MOST] = blocks(5 * _MILLION)
-    s[_FIRST] = blocks(2 * _MILLION)
+    s[_FAR_MOST] = blocks(5 * MILLION)
+    s[_FIRST] = blocks(2 * MILLION)

@@ -1,10 +1,9 @@
 # Integer kernels of the quaternion Kalman filter (quaternion_kalman.py): the covariance, its propagation and scalar
-# measurements; rest and magnetic field. Needs the viper emitter of MicroPython, or CPython with a stand-in
-# `micropython` module. All of it is made for a hard interrupt: it allocates nothing, raises nothing, uses no float, and
-# gives the same bits on every port.
+# measurements; rest and magnetic field. Needs the viper emitter; earth_kernels.py has what is not this filter's alone,
+# and what a state and a block are. All of it is made for a hard interrupt: it allocates nothing, raises nothing, uses
+# no float, and gives the same bits on every port.
 #
-# The kernels work on the filter's state, one array('i') that starts as fixmath.py's (probe, quaternion, half angle;
-# `turn` needs no more). The error state x, true less estimated:
+# The error state x, true less estimated:
 #     0 1 2  attitude, rotation vector in the earth frame     2**-15 rad
 #     3 4 5  gyro bias in the body, times the block           2**-C rad; C such that bias_start is below 26000
 #     6 7    horizontal velocity / (g * block)                2**-10
@@ -16,103 +15,95 @@ from array import array
 import micropython
 from micropython import const
 
-_PROBE = const(0)
-_Q = const(1)
-_O = const(17)  # 3: minus the bias as a half angle per step, Q31
-_OR = const(20)  # 3: its last bits, 2**-46, -32767..32767
-# the filter's own words, after fixmath's WR; quaternion_kalman.py has the same list
-_F = const(23)  # 3: correction of the next step in the earth frame, half angle, Q31
-_R = const(26)  # 9: rotation matrix; rows are north, west, up in the body; Q15
-_HS = const(35)  # 3: specific force in the earth frame, summed over the block, counts, Q9
-_AS = const(38)  # 3: accelerometer counts, summed
-_GS = const(41)  # 3: gyro counts, summed
-_MS = const(44)  # 3: magnetometer in the earth frame, summed, counts, Q9
-_MN = const(47)  # samples in it
-_BLOCK = const(49)  # log2 of the steps of a block
-_DECIDED = const(52)  # yes/no decisions, for the tests' float twin
-_T = const(55)  # 9: R at the end of the block
-_H = const(64)  # 3: the block's mean specific force in the earth frame, g, Q20
-_AM = const(67)  # 3: AS of the block
-_GM = const(70)  # 3: GS of the block
-_ML = const(73)  # 3: MS of the block
-_MLN = const(76)  # MN of the block
-_X = const(77)  # 8: estimated errors, not applied yet; 10 bits finer than P's units
-_V = const(85)  # 2: horizontal velocity, g * block, Q20
-_B = const(87)  # 3: learned bias, 2**-(C + 10) rad a block
-_P = const(90)  # 36: upper triangle of the covariance, row by row
-_N = const(126)  # 9: attitude-bias part of P, mean of before and after the block
-_ROW = const(135)  # 8: row of P of what is measured
-_M = const(143)  # 8: gain of error i = M / 2**(E + 15), M of 28 to 31 bits
-_E = const(151)  # 8
-_FOLDED = const(159)  # 3: correction that the new block starts with, rad, Q25
-_UH = const(162)  # which error is measured ...
-_UE = const(163)  # ... its measured value, in X's units ...
-_UR = const(164)  # ... its variance / 16, in P's units ...
-_UM = const(165)  # ... bits of the errors that it must not correct
-_OVER = const(166)  # 1: it was beyond 2.5 sigma
-_MEANT = const(249)  # 2: tilt from the accelerometer as it is, X's units
-_HG = const(168)  # HS to H: HG / 2**HG_SHIFT
-_HG_SHIFT = const(169)
-_C = const(170)  # C - 15
-_B_SHIFT = const(171)  # B to half angle per step, Q31
-_B_MOST = const(172)
-_QT = const(173)  # variance that a block adds to the attitude, 2**-16 of P's unit ...
-_QTR = const(174)  # ... and what is carried of it
-_QB = const(175)  # the same for the bias, 2**-12
-_QBR = const(176)
-_QS = const(177)  # variance per (4 counts)**2 of the gyro: QS / 2**QS_SHIFT
-_QS_SHIFT = const(178)
-_BS = const(179)  # first variance of the bias
-_RV = const(180)  # variances / 16: velocity ...
-_RM = const(181)  # ... heading from one block ...
-_RA = const(183)  # ... accelerometer believed as it is
-_V0 = const(184)  # first variance of the velocity
-_LOW1 = const(185)  # 6: first low-pass of accelerometer, gyro less base; counts, Q12
-_LOW2 = const(191)  # 6: second
-_BASE = const(197)  # 3: gyro bias that was set, 1/256 count
-_O_BASE = const(200)  # 3: O of BASE alone
-_OR_BASE = const(203)  # 3: its last bits
-_Z = const(206)  # 3: low-passed gyro in B's units
-_BLOCKS = const(209)  # of the rest detector's start
-_STILL = const(210)  # blocks without motion, no more than REST_AFTER
-_REST_AFTER = const(211)
-_REST_K = const(212)  # Q15
-_REST_GYRO = const(213)  # counts**2, Q6
-_REST_ACCEL = const(214)  # counts**2, Q6
-_REST_MOST = const(215)  # most that is taken for a bias, counts, Q12
-_REST_OFF = const(216)  # most that a known bias may be off, B's units
-_KNOWN = const(217)  # variance of a known bias
-_CB = const(218)  # counts (Q12) to B's units: CB / 2**CB_SHIFT
-_CB_SHIFT = const(219)
-_WIDE_FOR = const(
-    221
-)  # blocks for which the accelerometer has been believed as it is; then 2, 1, 0
-_WIDE_MOST = const(222)
-_LOST = const(223)  # blocks with the velocity beyond 2.5 sigma
-_LOST_MOST = const(224)
-_SINCE = const(225)  # blocks since the last with a magnetometer sample
-_J = const(226)  # blocks that the heading of this block stands for; 0: none
-_ERR = const(227)  # heading error, rad, Q25
-_NOW = const(228)  # 2: horizontal and vertical field, counts, Q13
-_FIELD = const(230)  # 2: smoothed
-_REF = const(232)  # 2: reference
-_HAVE = const(234)  # 1: there is one
-_NEAR = const(235)  # blocks near the reference, no more than FIELD_AFTER
-_AGE = const(236)  # blocks with a field, no more than 16384
-_FAR = const(237)  # blocks of large heading error
-_FIELD_AFTER = const(238)
-_TOL = const(240)  # tolerance squared, Q14
-_SMOOTH = const(241)  # blocks of 0.05 s, Q10
-_TAU = const(242)  # blocks of the reference's time constant, Q10
-_TAU_FAR = const(243)  # the same while the field is another
-_FAR_MOST = const(244)
-_GOOD = const(245)  # 1: the field is that of the reference; 2: there is no reference yet
-_FIRST = const(246)  # blocks after which there is one
-_NOISE = const(247)  # variance / 16 of the heading
-_TAU_0 = const(248)  # blocks of 0.2 s, Q10
-_YOUNG = const(251)  # blocks until motion tells of the bias
-_AFTER = const(252)  # the same at the start
-WORDS = const(253)
+from upright.earth_kernels import low_pass
+
+# -- words of the state: written by tools/upright_host/words.py
+_PROBE = const(0)  # always -1, see fixmath.py
+_O = const(17)  # 3, Q31: minus the bias as a half angle per step
+_OR = const(20)  # 3, Q46: its last bits, -32767..32767
+_BASE = const(23)  # 3, Q8: gyro bias that was set, counts
+_O_BASE = const(26)  # 3, Q31: O of BASE alone
+_OR_BASE = const(29)  # 3, Q46: its last bits
+_B = const(32)  # 3: learnt bias on top of BASE, in the filter's own unit
+_TURN = const(35)  # 3, Q31: correction that the next step takes up, earth frame, half angle
+_R = const(38)  # 9, Q15: rotation matrix; its rows are north, west, up in the body
+_BLOCK = const(51)  # log2 of the steps of a block
+_DECIDED = const(54)  # yes/no decisions, for the tests' float twin
+_GS = const(55)  # 3: gyro counts summed over the block
+_MS = const(58)  # 3, Q9: magnetometer in the earth frame, counts, summed over the block
+_MN = const(61)  # samples in it
+_J = const(63)  # blocks that the heading of this block stands for; 0: none
+_HEADING = const(64)  # Q28: heading error, rad
+_NOW = const(65)  # 2, Q13: horizontal and vertical field, counts
+_IN = const(67)  # 6, Q12: what LOW1 takes up: accelerometer, gyro less BASE, counts
+_LOW2 = const(79)  # 6, Q12: second
+_AWAY = const(85)  # 2, Q6: squared distance from LOW2 of accelerometer and gyro, counts**2
+_STILL = const(88)  # blocks without motion, no more than REST_AFTER
+_REST_AFTER = const(89)  # blocks
+_REST_GYRO = const(91)  # Q6: at rest AWAY is less: counts**2
+_REST_ACCEL = const(92)  # Q6: the same of the accelerometer
+_REST_MOST = const(93)  # Q12: most that is taken for a bias, counts
+_HS = const(94)  # 3, Q9: specific force in the earth frame, summed over the block, counts
+_AS = const(97)  # 3: accelerometer counts, summed
+_T = const(102)  # 9, Q15: R at the end of the block
+_H = const(111)  # 3, Q20: the block's mean specific force in the earth frame, g
+_AM = const(114)  # 3: AS of the block; AM and GM stand together
+_GM = const(117)  # 3: GS of the block
+_ML = const(120)  # 3, Q9: MS of the block
+_MLN = const(123)  # MN of the block
+_X = const(124)  # 8: estimated errors, not applied yet; 10 bits finer than P's units
+_V = const(132)  # 2, Q20: horizontal velocity, g * block
+_P = const(134)  # 36: upper triangle of the covariance, row by row
+_N = const(170)  # 9: attitude-bias part of P, mean of before and after the block
+_ROW = const(179)  # 8: row of P of what is measured
+_M = const(187)  # 8: gain of error i = M / 2**(E + 15), M of 28 to 31 bits
+_E = const(195)  # 8
+_FOLDED = const(203)  # 3, Q25: correction that the new block starts with, rad
+_UH = const(206)  # which error is measured ...
+_UE = const(207)  # ... its measured value, in X's units ...
+_UR = const(208)  # ... its variance / 16, in P's units ...
+_UM = const(209)  # ... bits of the errors that it must not correct
+_OVER = const(210)  # 1: it was beyond 2.5 sigma
+_MEANT = const(211)  # 2: tilt from the accelerometer as it is, X's units
+_HG = const(213)  # HS to H: HG / 2**HG_SHIFT
+_HG_SHIFT = const(214)
+_C = const(215)  # C - 15; the bias is in units of 2**-C rad a block, B 10 bits finer
+_B_SHIFT = const(216)  # B to half angle per step, Q31
+_B_MOST = const(217)  # bound of B
+_QT = const(218)  # variance that a block adds to the attitude, 2**-16 of P's unit ...
+_QTR = const(219)  # ... and what is carried of it
+_QB = const(220)  # the same for the bias, 2**-12
+_QBR = const(221)
+_QS = const(222)  # variance per (4 counts)**2 of the gyro: QS / 2**QS_SHIFT
+_QS_SHIFT = const(223)
+_BS = const(224)  # first variance of the bias
+_RM = const(226)  # ... heading from one block ...
+_Z = const(231)  # 3: low-passed gyro in B's units
+_REST_OFF = const(234)  # most that a known bias may be off, B's units
+_KNOWN = const(235)  # variance of a known bias
+_CB = const(236)  # counts (Q12) to B's units: CB / 2**CB_SHIFT
+_CB_SHIFT = const(237)
+_WIDE_FOR = const(238)  # blocks for which the accelerometer has been believed as it is; then 2, 1, 0
+_WIDE_MOST = const(239)
+_LOST = const(240)  # blocks with the velocity beyond 2.5 sigma
+_LOST_MOST = const(241)
+_FIELD = const(242)  # 2, Q13: smoothed field, counts; NOW, FIELD and REF as (horizontal, vertical)
+_REF = const(244)  # 2, Q13: reference
+_HAVE = const(246)  # 1: there is one
+_NEAR = const(247)  # blocks near the reference, no more than FIELD_AFTER
+_AGE = const(248)  # blocks with a field, no more than 16384
+_FAR = const(249)  # blocks of large heading error
+_FIELD_AFTER = const(250)  # blocks
+_TOL = const(251)  # Q14: tolerance squared
+_SMOOTH = const(252)  # Q10: blocks of 0.05 s
+_TAU = const(253)  # Q10: blocks of the reference's time constant
+_TAU_FAR = const(254)  # Q10: the same while the field is another
+_TAU_0 = const(255)  # Q10: blocks of 0.2 s
+_FAR_MOST = const(256)  # blocks
+_GOOD = const(257)  # 1: the field is that of the reference; 2: there is no reference yet
+_FIRST = const(258)  # blocks after which there is one
+_NOISE = const(259)  # variance / 16 of the heading
+# -- end of the words
 
 _STILL_BIT = const(1)
 _NEAR_BIT = const(2)
@@ -145,86 +136,10 @@ _AT = array(
     ],
 )
 
-# atan(2**-i) in rad, Q28
-# fmt: off
-_ATAN = array("i", [
-    210828714, 124459457, 65760959, 33381290, 16755422, 8385879, 4193963, 2097109, 1048571,
-    524287, 262144, 131072, 65536, 32768, 16384, 8192, 4096, 2048, 1024, 512,
-])
-# fmt: on
-
-
-# ------------------------------------------------------------------------------------------ every step
-@micropython.viper
-def level(s: ptr32, counts: ptr16):
-    """R of Q; the specific force in the earth frame, R a, and the counts themselves go into the block's sums.
-
-    a is as measured: neither normalised nor left out at full scale, so that what comes in swings cancels.
-    """
-    k = 0
-    if s[_PROBE] > 0:
-        k = 32
-    a = ((s[_Q] << k >> k) + 8192) >> 14
-    b = ((s[_Q + 1] << k >> k) + 8192) >> 14
-    c = ((s[_Q + 2] << k >> k) + 8192) >> 14
-    d = ((s[_Q + 3] << k >> k) + 8192) >> 14
-    x = ((counts[0] & 0xFFFF) ^ 0x8000) - 0x8000
-    y = ((counts[1] & 0xFFFF) ^ 0x8000) - 0x8000
-    z = ((counts[2] & 0xFFFF) ^ 0x8000) - 0x8000
-    s[_AS] = (s[_AS] << k >> k) + x
-    s[_AS + 1] = (s[_AS + 1] << k >> k) + y
-    s[_AS + 2] = (s[_AS + 2] << k >> k) + z
-    m = 32768 - ((c * c + d * d + 8192) >> 14)
-    n = (b * c - a * d + 8192) >> 14
-    o = (b * d + a * c + 8192) >> 14
-    s[_R] = m
-    s[_R + 1] = n
-    s[_R + 2] = o
-    s[_HS] = (s[_HS] << k >> k) + ((m * x + n * y + o * z + 32) >> 6)
-    m = (b * c + a * d + 8192) >> 14
-    n = 32768 - ((b * b + d * d + 8192) >> 14)
-    o = (c * d - a * b + 8192) >> 14
-    s[_R + 3] = m
-    s[_R + 4] = n
-    s[_R + 5] = o
-    s[_HS + 1] = (s[_HS + 1] << k >> k) + ((m * x + n * y + o * z + 32) >> 6)
-    m = (b * d - a * c + 8192) >> 14
-    n = (c * d + a * b + 8192) >> 14
-    o = 32768 - ((b * b + c * c + 8192) >> 14)
-    s[_R + 6] = m
-    s[_R + 7] = n
-    s[_R + 8] = o
-    s[_HS + 2] = (s[_HS + 2] << k >> k) + ((m * x + n * y + o * z + 32) >> 6)
-
-
-@micropython.viper
-def gather(s: ptr32, counts: ptr16):
-    """Add a magnetometer sample, turned into the earth frame, to the block's sum.
-
-    Left out: all zero, an axis at full scale.
-    """
-    k = 0
-    if s[_PROBE] > 0:
-        k = 32
-    x = ((counts[6] & 0xFFFF) ^ 0x8000) - 0x8000
-    y = ((counts[7] & 0xFFFF) ^ 0x8000) - 0x8000
-    z = ((counts[8] & 0xFFFF) ^ 0x8000) - 0x8000
-    if (x | y | z) == 0:
-        return
-    if x > 32766 or y > 32766 or z > 32766 or x < -32766 or y < -32766 or z < -32766:
-        return
-    s[_MN] += 1
-    t = (s[_R] << k >> k) * x + (s[_R + 1] << k >> k) * y + (s[_R + 2] << k >> k) * z
-    s[_MS] = (s[_MS] << k >> k) + ((t + 32) >> 6)
-    t = (s[_R + 3] << k >> k) * x + (s[_R + 4] << k >> k) * y + (s[_R + 5] << k >> k) * z
-    s[_MS + 1] = (s[_MS + 1] << k >> k) + ((t + 32) >> 6)
-    t = (s[_R + 6] << k >> k) * x + (s[_R + 7] << k >> k) * y + (s[_R + 8] << k >> k) * z
-    s[_MS + 2] = (s[_MS + 2] << k >> k) + ((t + 32) >> 6)
-
 
 # ------------------------------------------------------------------------------------------ end of a block
 @micropython.viper
-def close(s: ptr32):
+def take_sums(s: ptr32):
     """Take over the block's sums and the attitude at its end, and begin new ones."""
     k = 0
     if s[_PROBE] > 0:
@@ -258,7 +173,7 @@ def close(s: ptr32):
 
 
 @micropython.viper
-def carry(s: ptr32):
+def carry_errors(s: ptr32):
     """Carry the errors found in the last block through this one, as the errors themselves went, and apply them.
 
     attitude -= R bias; velocity += attitude x up. Then bias and velocity take theirs at once, the attitude with the
@@ -299,7 +214,7 @@ def carry(s: ptr32):
             y = 0 - _FOLD_MOST
         s[_X + i] = x - y
         s[_FOLDED + i] = y
-        s[_F + i] = y << 5
+        s[_TURN + i] = y << 5
         x = (s[_B + i] << k >> k) + (s[_X + 3 + i] << k >> k)
         s[_X + 3 + i] = 0
         if x > s[_B_MOST]:
@@ -326,8 +241,8 @@ def carry(s: ptr32):
 
 # ------------------------------------------------------------------------------------------ covariance of a block
 @micropython.viper
-def spread(s: ptr32):
-    """Attitude -= R bias, in the columns of bias and velocity: P_ab -= R P_bb, P_av -= R P_bv. N for `swell`."""
+def spread_bias(s: ptr32):
+    """Attitude -= R bias, in the columns of bias and velocity: P_ab -= R P_bb, P_av -= R P_bv; N is made."""
     k = 0
     if s[_PROBE] > 0:
         k = 32
@@ -361,7 +276,7 @@ def spread(s: ptr32):
 
 
 @micropython.viper
-def swell(s: ptr32):
+def spread_attitude(s: ptr32):
     """The same in the attitude's own part: P_aa -= N R' + R N', where N is P_ab halfway through the block."""
     k = 0
     if s[_PROBE] > 0:
@@ -406,7 +321,7 @@ def swell(s: ptr32):
 
 
 @micropython.viper
-def run(s: ptr32):
+def spread_velocity(s: ptr32):
     """Velocity += attitude x up: v0 += a1, v1 -= a0."""
     k = 0
     if s[_PROBE] > 0:
@@ -431,7 +346,7 @@ def run(s: ptr32):
 
 
 @micropython.viper
-def noise(s: ptr32):
+def add_noise(s: ptr32):
     """What a block adds to the variances: gyro noise, the gyro's scale errors, wandering of the bias.
 
     Where a variance would outgrow its 30 bits, all of its row is halved (a quarter of the variance): a congruence, so
@@ -479,7 +394,7 @@ def noise(s: ptr32):
 
 
 @micropython.viper
-def open_up(s: ptr32, i: int, variance: int):
+def forget(s: ptr32, i: int, variance: int):
     """Nothing is known of error i any more, but its size."""
     at = ptr8(_AT)
     j = 0
@@ -492,7 +407,7 @@ def open_up(s: ptr32, i: int, variance: int):
 
 # ------------------------------------------------------------------------------------------ a measurement
 @micropython.viper
-def gain(s: ptr32):
+def find_gains(s: ptr32):
     """Error UH is UE, with variance 16 UR: gains of all errors, and what they make of X.
 
     The innovation is bounded by 5 sigma. Gain of i: P_ih / (P_hh + r), as a mantissa and a shift of its own.
@@ -569,7 +484,7 @@ def gain(s: ptr32):
 
 
 @micropython.viper
-def shrink(s: ptr32):
+def shrink_covariance(s: ptr32):
     """P_ij -= gain_i P_jh, but for pairs of which neither must be corrected (Schmidt's form)."""
     k = 0
     if s[_PROBE] > 0:
@@ -611,81 +526,61 @@ def shrink(s: ptr32):
 
 # ------------------------------------------------------------------------------------------ what is measured
 @micropython.viper
-def rest(s: ptr32):
-    """Rest: gyro and accelerometer stay near their two-pole low-passes, the gyro near its bias where that is known.
+def measure_rest(state):
+    """STILL: for how long gyro and accelerometer have stayed near their low-passes, the gyro near a well-known bias.
 
-    At rest a tilt error that cannot be opens the attitude up.
+    Z: the low-passed gyro, which measures the bias then. At rest a tilt error that cannot be is UPSET.
     """
+    s = ptr32(state)
     k = 0
     if s[_PROBE] > 0:
         k = 32
     at = ptr8(_AT)
-    rate = s[_REST_K]
-    i = s[_BLOCKS] + 1
-    if i * rate < 32768:
-        s[_BLOCKS] = i
-        rate = 32768 // i  # the mean of all, until the low-pass takes over
     fine = 12 - s[_BLOCK]
-    still = 1
-    total = 0
     i = 0
-    while i < 6:
-        x = (s[_AM + i] << k >> k) << fine
-        if i > 2:
-            x -= (s[_BASE + i - 3] << k >> k) << 4
-        f = s[_LOW1 + i] << k >> k
-        v = x - f
-        h = v >> 15
-        f += h * rate + ((v - (h << 15)) * rate + 16384 >> 15)
-        s[_LOW1 + i] = f
-        v = s[_LOW2 + i] << k >> k
-        f -= v
-        h = f >> 15
-        v += h * rate + ((f - (h << 15)) * rate + 16384 >> 15)
-        s[_LOW2 + i] = v
-        x = x - v >> 9
-        if x < 0:
-            x = 0 - x
-        if x > 16383:
-            x = 16383
-        total += x * x
-        if i == 2:
-            if total >= s[_REST_ACCEL]:
-                still = 0
-            total = 0
-        if i > 2:
-            f = s[_REST_MOST]
-            if v > f:
-                v = f
-                still = 0
-            elif v < 0 - f:
-                v = 0 - f
-                still = 0
-            h = v >> 13
-            v -= h << 13
-            f = s[_CB_SHIFT]
-            h = h * s[_CB]
-            v = v * s[_CB]
-            if f < 13:
-                v = (h << 13 - f) + (v >> f)
-            else:
-                v = h + (v >> 13) >> f - 13
-            s[_Z + i - 3] = v
-            v -= s[_B + i - 3] << k >> k
-            if v < 0:
-                v = 0 - v
-            if s[_P + at[9 * i]] < s[_KNOWN] and v > s[_REST_OFF]:
-                still = 0
+    while i < 3:
+        s[_IN + i] = (s[_AM + i] << k >> k) << fine
+        s[_IN + 3 + i] = ((s[_GM + i] << k >> k) << fine) - ((s[_BASE + i] << k >> k) << 4)
+        i += 1
+    low_pass(state, _IN)
+    # still: |IN - LOW2| small, |gyro| <= REST_MOST, and |Z - B| <= REST_OFF where the variance of B is below KNOWN
+    still = s[_AWAY] < s[_REST_ACCEL] and s[_AWAY + 1] < s[_REST_GYRO]
+    i = 0
+    while i < 3:
+        v = s[_LOW2 + 3 + i] << k >> k
+        f = s[_REST_MOST]
+        if v > f:
+            v = f
+            still = False
+        elif v < 0 - f:
+            v = 0 - f
+            still = False
+        h = v >> 13
+        v -= h << 13
+        f = s[_CB_SHIFT]
+        h = h * s[_CB]
+        v = v * s[_CB]
+        if f < 13:
+            v = (h << 13 - f) + (v >> f)
+        else:
+            v = h + (v >> 13) >> f - 13
+        s[_Z + i] = v
+        v -= s[_B + i] << k >> k
+        if v < 0:
+            v = 0 - v
+        if s[_P + at[27 + 9 * i]] < s[_KNOWN] and v > s[_REST_OFF]:
+            still = False
         i += 1
     decided = (s[_DECIDED] | (_STILL_BIT | _UPSET)) ^ _UPSET
     i = 0
-    if still and total < s[_REST_GYRO]:
+    if still:
         i = s[_STILL] + 1
         if i > s[_REST_AFTER]:
             i = s[_REST_AFTER]
     else:
         decided ^= _STILL_BIT
     s[_STILL] = i
+    # upset: at rest, and |(H0, H1)| > 1/4 g
     x = (s[_H] << k >> k) >> 10
     v = (s[_H + 1] << k >> k) >> 10
     if i == s[_REST_AFTER]:
@@ -695,7 +590,7 @@ def rest(s: ptr32):
 
 
 @micropython.viper
-def tilted(s: ptr32):
+def tilt_from_accel(s: ptr32):
     """WIDE: whether the accelerometer is believed as it is; MEANT: what it then says of the tilt."""
     k = 0
     if s[_PROBE] > 0:
@@ -741,7 +636,7 @@ def tilted(s: ptr32):
 
 
 @micropython.viper
-def settle(s: ptr32) -> int:
+def after_tilt(s: ptr32) -> int:
     """After both measurements of the tilt -> what to open up: bit 0 attitude, bit 1 velocity."""
     decided = s[_DECIDED]
     if decided & _WIDE:
@@ -776,65 +671,7 @@ def settle(s: ptr32) -> int:
 
 
 @micropython.viper
-def compass(s: ptr32):
-    """ERR: the heading error, from the block's mean field; NOW: its horizontal and vertical part. CORDIC."""
-    k = 0
-    if s[_PROBE] > 0:
-        k = 32
-    n = s[_MLN]
-    j = s[_SINCE] + 1
-    if j > 16:
-        j = 16
-    s[_SINCE] = j
-    s[_J] = 0
-    if n == 0:
-        return
-    s[_J] = j
-    s[_SINCE] = 0
-    x = (s[_ML] << k >> k) // n << 4
-    y = 0 - ((s[_ML + 1] << k >> k) // n << 4)
-    s[_NOW + 1] = (s[_ML + 2] << k >> k) // n << 4
-    angle = 0
-    if x < 0:
-        angle = _PI25 << 3
-        if y < 0:
-            angle = 0 - angle
-        x = 0 - x
-        y = 0 - y
-    t = y
-    if t < 0:
-        t = 0 - t
-    if x + t == 0:
-        s[_ERR] = 0
-        s[_NOW] = 0
-        return
-    shift = 0
-    while x + t < 0x10000000:
-        x <<= 1
-        y <<= 1
-        t <<= 1
-        shift += 1
-    table = ptr32(_ATAN)
-    i = 0
-    while i < 20:
-        t = y >> i
-        if y > 0:
-            y -= x >> i
-            x += t
-            angle += table[i]
-        else:
-            y += x >> i
-            x -= t
-            angle -= table[i]
-        i += 1
-    s[_ERR] = angle + 4 >> 3
-    # x is 1.64676 times the length
-    t = x >> 15
-    s[_NOW] = t * 19898 + ((x - (t << 15)) * 19898 >> 15) >> shift
-
-
-@micropython.viper
-def field(s: ptr32):
+def weigh_field(s: ptr32):
     """GOOD: whether the field is that of its reference, which follows; NOISE: the less it is, the larger."""
     k = 0
     if s[_PROBE] > 0:
@@ -856,12 +693,12 @@ def field(s: ptr32):
     decided = s[_DECIDED] | _NEAR_BIT
     # squared distances from the reference, as a part of it, Q14: of the smoothed field, of this one
     off = 0
-    i = 2
-    while i >= 0:
+    i = _FIELD
+    while i:
         x = s[_REF] << k >> k
         y = s[_REF + 1] << k >> k
-        n = (s[_NOW + i] << k >> k) - x
-        m = (s[_NOW + 1 + i] << k >> k) - y
+        n = (s[i] << k >> k) - x
+        m = (s[i + 1] << k >> k) - y
         if y < 0:
             y = 0 - y
         if n < 0:
@@ -874,9 +711,12 @@ def field(s: ptr32):
             n >>= 1
             m >>= 1
         off = (n * n + m * m) // ((x * x + y * y >> 14) + 1)
-        if i and off >= s[_TOL]:
-            decided ^= _NEAR_BIT
-        i -= 2
+        if i == _FIELD:
+            i = _NOW
+            if off >= s[_TOL]:
+                decided ^= _NEAR_BIT
+        else:
+            i = 0
     s[_DECIDED] = decided
     n = s[_RM] // j
     if off > 1310:
@@ -921,7 +761,7 @@ def field(s: ptr32):
 
 
 @micropython.viper
-def steer(s: ptr32) -> int:
+def ready_for_heading(s: ptr32) -> int:
     """Make ready to measure the heading -> 0: not now, 1: do; 3: and open it up before."""
     k = 0
     if s[_PROBE] > 0:
@@ -936,7 +776,7 @@ def steer(s: ptr32) -> int:
         if n > 4026532:  # 0.06 rad**2
             n = 4026532
     s[_UR] = n
-    e = s[_ERR] << k >> k
+    e = (s[_HEADING] << k >> k) + 4 >> 3
     if e > _FAR_RAD or e < 0 - _FAR_RAD:
         decided |= _FAR_BIT
     s[_DECIDED] = decided

@@ -1,0 +1,435 @@
+# What the two filters that average in the earth frame share: inertial.py and quaternion_kalman.py. The kernels of every
+# step, of the magnetometer's heading and of rest; below them the class that both are. Needs attitude.py, fixmath.py and
+# the viper emitter. The kernels allocate nothing, raise nothing, use no float, and give the same bits on every port.
+#
+# The kernels work on a filter's state, one array('i') that starts as fixmath.py's (probe, quaternion, half angle;
+# `turn` needs no more). A block is 2**BLOCK steps of 22 to 44 ms together (up to 80 ms below 90 Hz): what is slow
+# runs once a block, each part on a step of its own, so its constants do not depend on the sample rate. Bounds:
+# docs/numerics.md.
+
+from array import array
+
+import micropython
+from micropython import const
+
+from upright import fixmath
+from upright.attitude import Attitude, bias_of, hertz
+from upright.fixmath import turn
+
+# -- words of the state: written by tools/upright_host/words.py
+_PROBE = const(0)  # always -1, see fixmath.py
+_Q = const(1)  # 4, Q29: quaternion w x y z, body to earth
+_QR = const(5)  # 4, Q44: what rounding has left of it, 0..32767
+_W = const(9)  # 3, Q31: half the angle of this step, rad
+_WR = const(12)  # 3, Q46: what rounding has left of it, 0..32767
+_G = const(15)  # Q31: half angle per step of one gyro count
+_GR = const(16)  # Q46: its last bits, 0..32767
+_O = const(17)  # 3, Q31: minus the bias as a half angle per step
+_OR = const(20)  # 3, Q46: its last bits, -32767..32767
+_BASE = const(23)  # 3, Q8: gyro bias that was set, counts
+_O_BASE = const(26)  # 3, Q31: O of BASE alone
+_OR_BASE = const(29)  # 3, Q46: its last bits
+_B = const(32)  # 3: learnt bias on top of BASE, in the filter's own unit
+_TURN = const(35)  # 3, Q31: correction that the next step takes up, earth frame, half angle
+_R = const(38)  # 9, Q15: rotation matrix; its rows are north, west, up in the body
+_FORCE = const(47)  # 3, Q15: specific force of this sample in the earth frame, counts
+_NINE = const(50)  # 1: use the magnetometer
+_BLOCK = const(51)  # log2 of the steps of a block
+_BLOCK_MASK = const(52)  # steps of a block less 1
+_PHASE = const(53)  # fresh steps of the block
+_GS = const(55)  # 3: gyro counts summed over the block
+_MS = const(58)  # 3, Q9: magnetometer in the earth frame, counts, summed over the block
+_MN = const(61)  # samples in it
+_SINCE = const(62)  # blocks since the last with a magnetometer sample, no more than 16
+_J = const(63)  # blocks that the heading of this block stands for; 0: none
+_HEADING = const(64)  # Q28: heading error, rad
+_NOW = const(65)  # 2, Q13: horizontal and vertical field, counts
+_IN = const(67)  # 6, Q12: what LOW1 takes up: accelerometer, gyro less BASE, counts
+_LOW1 = const(73)  # 6, Q12: first low-pass of it
+_LOW2 = const(79)  # 6, Q12: second
+_AWAY = const(85)  # 2, Q6: squared distance from LOW2 of accelerometer and gyro, counts**2
+_BLOCKS = const(87)  # of the low-passes' start
+_STILL = const(88)  # blocks without motion, no more than REST_AFTER
+_REST_AFTER = const(89)  # blocks
+_REST_K = const(90)  # Q15: gain of the low-passes
+_REST_GYRO = const(91)  # Q6: at rest AWAY is less: counts**2
+_REST_ACCEL = const(92)  # Q6: the same of the accelerometer
+# -- end of the words
+
+
+MILLION = const(1000000)
+_STEP_MAX = const((1 << 31) - (1 << 16))  # 1 rad in Q31, less what fixmath.turn adds for rounding
+
+# atan(2**-i) in rad, Q28
+# fmt: off
+_ATAN = array("i", [
+    210828714, 124459457, 65760959, 33381290, 16755422, 8385879, 4193963, 2097109, 1048571,
+    524287, 262144, 131072, 65536, 32768, 16384, 8192, 4096, 2048, 1024, 512,
+])
+# fmt: on
+
+
+# ------------------------------------------------------------------------------------------ every step
+@micropython.viper
+def advance(state, counts):
+    """Turn Q by the gyro; a fresh sample besides takes up TURN, renews R and FORCE and goes into the sums GS, MS, MN.
+
+    The accelerometer is taken as measured: neither normalised nor left out at full scale, so that what comes in swings
+    cancels. A magnetometer sample is left out when all of it is zero or an axis is at full scale.
+    """
+    s = ptr32(state)
+    c = ptr16(counts)
+    k = 0
+    if s[_PROBE] > 0:
+        k = 32
+    # W = (gyro - bias) dt / 2
+    gain = s[_G]
+    fine = s[_GR]
+    n = ((c[3] & 0xFFFF) ^ 0x8000) - 0x8000
+    x = (s[_O] << k >> k) + n * gain
+    u = (s[_OR] << k >> k) + n * fine + s[_WR]
+    m = ((c[4] & 0xFFFF) ^ 0x8000) - 0x8000
+    y = (s[_O + 1] << k >> k) + m * gain
+    v = (s[_OR + 1] << k >> k) + m * fine + s[_WR + 1]
+    o = ((c[5] & 0xFFFF) ^ 0x8000) - 0x8000
+    z = (s[_O + 2] << k >> k) + o * gain
+    w = (s[_OR + 2] << k >> k) + o * fine + s[_WR + 2]
+    fresh = c[10] & 1
+    if fresh:
+        s[_GS] = (s[_GS] << k >> k) + n
+        s[_GS + 1] = (s[_GS + 1] << k >> k) + m
+        s[_GS + 2] = (s[_GS + 2] << k >> k) + o
+        if s[_TURN] | s[_TURN + 1] | s[_TURN + 2]:
+            # W += R' TURN, from the earth into the body
+            i = 0
+            r = _R
+            while i < 3:
+                n = s[_TURN + i] << k >> k
+                s[_TURN + i] = 0
+                m = (n + 16384) >> 15
+                n -= m << 15
+                o = s[r] << k >> k
+                x += o * m + (o * n + 16384 >> 15)
+                o = s[r + 1] << k >> k
+                y += o * m + (o * n + 16384 >> 15)
+                o = s[r + 2] << k >> k
+                z += o * m + (o * n + 16384 >> 15)
+                r += 3
+                i += 1
+    s[_WR] = u & 32767
+    s[_W] = x + (u >> 15)
+    s[_WR + 1] = v & 32767
+    s[_W + 1] = y + (v >> 15)
+    s[_WR + 2] = w & 32767
+    s[_W + 2] = z + (w >> 15)
+    turn(state)
+    if fresh:
+        # R of Q = (a, b, c, d), row by row; FORCE = R accel
+        u = ((s[_Q] << k >> k) + 8192) >> 14
+        v = ((s[_Q + 1] << k >> k) + 8192) >> 14
+        w = ((s[_Q + 2] << k >> k) + 8192) >> 14
+        r = ((s[_Q + 3] << k >> k) + 8192) >> 14
+        x = ((c[0] & 0xFFFF) ^ 0x8000) - 0x8000
+        y = ((c[1] & 0xFFFF) ^ 0x8000) - 0x8000
+        z = ((c[2] & 0xFFFF) ^ 0x8000) - 0x8000
+        m = 32768 - ((w * w + r * r + 8192) >> 14)
+        n = (v * w - u * r + 8192) >> 14
+        o = (v * r + u * w + 8192) >> 14
+        s[_R] = m
+        s[_R + 1] = n
+        s[_R + 2] = o
+        s[_FORCE] = m * x + n * y + o * z
+        m = (v * w + u * r + 8192) >> 14
+        n = 32768 - ((v * v + r * r + 8192) >> 14)
+        o = (w * r - u * v + 8192) >> 14
+        s[_R + 3] = m
+        s[_R + 4] = n
+        s[_R + 5] = o
+        s[_FORCE + 1] = m * x + n * y + o * z
+        m = (v * r - u * w + 8192) >> 14
+        n = (w * r + u * v + 8192) >> 14
+        o = 32768 - ((v * v + w * w + 8192) >> 14)
+        s[_R + 6] = m
+        s[_R + 7] = n
+        s[_R + 8] = o
+        s[_FORCE + 2] = m * x + n * y + o * z
+        if c[10] & 2 and s[_NINE]:
+            # MS += R mag
+            x = ((c[6] & 0xFFFF) ^ 0x8000) - 0x8000
+            y = ((c[7] & 0xFFFF) ^ 0x8000) - 0x8000
+            z = ((c[8] & 0xFFFF) ^ 0x8000) - 0x8000
+            full = x > 32766 or y > 32766 or z > 32766 or x < -32766 or y < -32766 or z < -32766
+            if (x | y | z) and not full:
+                s[_MN] += 1
+                i = 0
+                r = _R
+                while i < 3:
+                    n = (s[r] << k >> k) * x + (s[r + 1] << k >> k) * y + (s[r + 2] << k >> k) * z
+                    s[_MS + i] = (s[_MS + i] << k >> k) + ((n + 32) >> 6)
+                    r += 3
+                    i += 1
+
+
+# ------------------------------------------------------------------------------------------ once a block
+@micropython.viper
+def compass(s: ptr32, at: int, half_turn: int):
+    """HEADING = atan2(-w, n), NOW = (hypot(n, w), up) of the block's mean field; J: how many blocks it stands for.
+
+    at: where north, west and up are summed (counts, Q9), and of how many samples in the fourth word; all become 0.
+    half_turn: pi in Q28, as the filter rounds it.
+    """
+    k = 0
+    if s[_PROBE] > 0:
+        k = 32
+    n = s[at + 3]
+    j = s[_SINCE] + 1
+    if j > 16:
+        j = 16
+    s[_SINCE] = j
+    s[_J] = 0
+    if n == 0:
+        return
+    s[_J] = j
+    s[_SINCE] = 0
+    x = (s[at] << k >> k) // n << 4
+    y = 0 - ((s[at + 1] << k >> k) // n << 4)
+    s[_NOW + 1] = (s[at + 2] << k >> k) // n << 4
+    s[at] = 0
+    s[at + 1] = 0
+    s[at + 2] = 0
+    s[at + 3] = 0
+    angle = 0
+    if x < 0:
+        angle = half_turn
+        if y < 0:
+            angle = 0 - angle
+        x = 0 - x
+        y = 0 - y
+    t = y
+    if t < 0:
+        t = 0 - t
+    if x + t == 0:
+        s[_HEADING] = 0
+        s[_NOW] = 0
+        return
+    shift = 0
+    while x + t < 0x10000000:
+        x <<= 1
+        y <<= 1
+        t <<= 1
+        shift += 1
+    # CORDIC, vectoring: each turn by +-atan(2**-i) brings (x, y) nearer to the x axis
+    table = ptr32(_ATAN)
+    i = 0
+    while i < 20:
+        t = y >> i
+        if y > 0:
+            y -= x >> i
+            x += t
+            angle += table[i]
+        else:
+            y += x >> i
+            x -= t
+            angle -= table[i]
+        i += 1
+    s[_HEADING] = angle
+    # x is 1.64676 times the length
+    t = x >> 15
+    s[_NOW] = t * 19898 + ((x - (t << 15)) * 19898 >> 15) >> shift
+
+
+@micropython.viper
+def low_pass(s: ptr32, seen: int):
+    """LOW1 += k (IN - LOW1); LOW2 += k (LOW1 - LOW2); AWAY = |seen - LOW2|**2 of accelerometer and gyro.
+
+    seen: where the 6 values stand that are judged, as IN; no difference counts with more than 2048 counts.
+    """
+    k = 0
+    if s[_PROBE] > 0:
+        k = 32
+    gain = s[_REST_K]
+    i = s[_BLOCKS] + 1
+    if i * gain < 32768:
+        s[_BLOCKS] = i
+        gain = 32768 // i  # the mean of all, until the low-pass takes over
+    total = 0
+    i = 0
+    while i < 6:
+        f = s[_LOW1 + i] << k >> k
+        v = (s[_IN + i] << k >> k) - f
+        h = v >> 15
+        f += h * gain + ((v - (h << 15)) * gain + 16384 >> 15)
+        s[_LOW1 + i] = f
+        v = s[_LOW2 + i] << k >> k
+        f -= v
+        h = f >> 15
+        v += h * gain + ((f - (h << 15)) * gain + 16384 >> 15)
+        s[_LOW2 + i] = v
+        v = ((s[seen + i] << k >> k) - v) >> 9
+        if v < 0:
+            v = 0 - v
+        if v > 16383:
+            v = 16383
+        total += v * v
+        i += 1
+        if i == 3:
+            s[_AWAY] = total
+            total = 0
+    s[_AWAY + 1] = total
+
+
+# ----------------------------------------------------------------------------- set-up and main loop: allocates
+class EarthFilter(Attitude):
+    """What both filters are set up and asked by. A filter below it has besides:
+
+    PARAMETERS             {name: (default, least, most)}, in s, rad, g, deg/s ...; taken to six significant digits
+    start_at(q, known)     see Attitude; known: 1 tilt, 2 tilt and heading are those of a sample, 0: nothing is known
+    bias_is_new(known_s)   a bias was set: forget what was learnt of it
+    bias_unit              (num, den): gyro counts of one unit of B
+    """
+
+    def __init__(self, rate, gyro_scale, accel_lsb_per_g, words, most_dps, room, parameters):
+        """Take rate, scales and parameters, or raise: `parameters` become millionths, in self.parameters.
+
+        most_dps(p): the largest bias that is learnt on top of set_bias, in millionths; room(p): what of 1 rad (Q31)
+        is kept for corrections.
+        """
+        Attitude.__init__(self, rate, gyro_scale, accel_lsb_per_g, words)
+        s = self.state
+        s[_NINE] = int(self.AXES == 9)
+        self.parameters = p = {}
+        for name in self.PARAMETERS:
+            default, least, most = self.PARAMETERS[name]
+            value = parameters.get(name, default)
+            p[name] = fixmath.quantise(value, name)
+            if not fixmath.quantise(least, "") <= p[name] <= fixmath.quantise(most, ""):
+                raise ValueError("%s is %r, expected %r..%r" % (name, value, least, most))
+        for name in parameters:
+            if name not in p:
+                raise TypeError("no parameter %r; there are %s" % (name, ", ".join(sorted(p))))
+        num, den = self.rate
+        scale, per = self.gyro_scale
+        shift = 2  # a block: at least 4 steps, 22 to 44 ms
+        while num >= 45 * den << shift:
+            shift += 1
+        text = hertz(self.rate)
+        if shift > 5 or num < 50 * den:
+            raise ValueError("rate is %s, expected 50..1439 Hz" % text)
+        gain = fixmath.ratio(fixmath.PI_NUM * den * per << 46, fixmath.PI_DEN * 360 * num * scale)
+        s[_G] = gain >> 15
+        s[_GR] = gain & 32767
+        s[_BLOCK] = shift
+        s[_BLOCK_MASK] = (1 << shift) - 1
+        s[_PHASE] = 1  # the first block is a whole one for the gyro's mean
+        # |W| < 1 rad with every axis at full scale against a bias of 8192 counts and the largest corrections
+        room = room(p)
+        counts_most = 32768 + 8192 + self.counts(most_dps(p), 1)
+        turn_most = (gain * counts_most >> 15) * 17321 // 10000
+        if turn_most + room > _STEP_MAX or gain < 1 << 17:
+            raise ValueError(
+                "rate is %s, expected %d..%d Hz at %d/%d LSB per deg/s: choose another rate or gyro range"
+                % (
+                    text,
+                    max(50, -(-turn_most * num // (den * (_STEP_MAX - room)))),
+                    min(1439, (gain * num // den) >> 17),
+                    scale,
+                    per,
+                )
+            )
+        if self.counts(p["rest_gyro_dps"], 1) > 2000:
+            raise ValueError("gyro_scale is %d/%d, too fine for rest_gyro_dps" % self.gyro_scale)
+        t = den << shift
+        s[_REST_K] = fixmath.ratio(t << 17, num + 4 * t)  # T / (1/4 + T), Q15
+        s[_REST_AFTER] = max(1, self.blocks(p["rest_after"]))
+        s[_REST_GYRO] = self.counts(p["rest_gyro_dps"], 8) ** 2
+        s[_REST_ACCEL] = fixmath.ratio(p["rest_accel_g"] * 8 * accel_lsb_per_g, MILLION) ** 2
+
+    def blocks(self, millionths, bits=0):
+        """A time in us as blocks, Q(bits)."""
+        num, den = self.rate
+        return fixmath.ratio(millionths * num << bits, MILLION * den << self.state[_BLOCK])
+
+    def counts(self, millionths, units):
+        """A rate in 1e-6 deg/s as gyro counts, times units."""
+        scale, per = self.gyro_scale
+        return fixmath.ratio(millionths * units * scale, MILLION * per)
+
+    def seed(self, counts):
+        """Take roll and pitch from one accelerometer sample, heading from the magnetometer's where flags bit 1 is set.
+
+        Without a magnetometer sample yaw is 0 (order zyx). Returns True, or False when the accelerometer is shorter
+        than 1/16 g: then the attitude is the identity. What has been learnt of bias and field stays. update() is to be
+        given the same sample next.
+        """
+        x, y, z = counts[0], counts[1], counts[2]
+        if (x * x + y * y + z * z) << 8 < self.accel_lsb_per_g**2:
+            self.start_at((fixmath.ONE, 0, 0, 0))
+            return False
+        i, j, k = counts[6], counts[7], counts[8]
+        across = y * k != z * j or z * i != x * k or x * j != y * i
+        if self.AXES == 9 and counts[10] & 2 and across:
+            self.start_at(fixmath.attitude_from_up_and_north((x, y, z), (i, j, k)), 2)
+        else:
+            self.start_at(fixmath.attitude_from_up(x, y, z), 1)
+        return True
+
+    def start_at(self, q):
+        s = self.state
+        for i in range(4):
+            s[_Q + i] = q[i]
+            s[_QR + i] = 16384
+        for i in range(3):
+            s[_WR + i] = 16384
+            s[_TURN + i] = 0
+            s[_MS + i] = 0
+        s[_MN] = s[_SINCE] = s[_J] = 0
+
+    def set_bias(self, x, y, z, known_s=0):
+        """Set the gyro's bias, ints in 1/256 of a gyro count; what the filter learns from now on comes on top of it.
+
+        known_s: how well it is known, as the seconds of rest over which it was averaged: 0..3600; 0: not at all.
+
+        Raises ValueError beyond +-8192 counts, and for a known_s that is none.
+        """
+        bias = bias_of(x, y, z, known_s)
+        s = self.state
+        gain = (s[_G] << 15) + s[_GR]
+        for i in range(3):
+            b = fixmath.ratio(bias[i] * gain, 256)
+            change = (s[_BASE + i] - bias[i]) << 4
+            s[_LOW1 + 3 + i] += change
+            s[_LOW2 + 3 + i] += change
+            s[_BASE + i] = bias[i]
+            s[_O + i] = s[_O_BASE + i] = -(b >> 15)
+            s[_OR + i] = s[_OR_BASE + i] = -(b & 32767)
+            s[_B + i] = 0
+        self.bias_is_new(known_s)
+
+    def bias(self, out):
+        """The gyro's bias, set and learnt, in 1/256 of a gyro count: out[0..2]. It may allocate."""
+        num, den = self.bias_unit
+        s = self.state
+        for i in range(3):
+            out[i] = s[_BASE + i] + fixmath.ratio(s[_B + i] * num << 8, den)
+
+    def bias_mdps(self, out):
+        """The gyro's bias, set and learnt, in millidegrees/s: out[0..2]. It may allocate."""
+        scale, per = self.gyro_scale
+        num, den = self.bias_unit
+        s = self.state
+        for i in range(3):
+            b = s[_BASE + i] * den + (s[_B + i] * num << 8)
+            out[i] = fixmath.ratio(b * 1000 * per, 256 * den * scale)
+
+    @property
+    def resting(self):
+        """True while the body is taken to be at rest: then the bias is what the gyro reads."""
+        return self.state[_STILL] == self.state[_REST_AFTER]
+
+
+def fine_mantissa(num, den, bits):
+    """(m, s) with num/den = m / 2**s and m of so many bits; s may not be negative."""
+    s = 0
+    while num and fixmath.ratio(num << (s + 1), den) < 1 << bits:
+        s += 1
+    return fixmath.ratio(num << s, den), s
