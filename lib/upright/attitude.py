@@ -41,7 +41,6 @@ class Attitude:
                 "accel_lsb_per_g is %r, expected an int, 64..32767" % (accel_lsb_per_g,)
             )
         self.accel_lsb_per_g = accel_lsb_per_g
-        self.bias_set = array("i", [0, 0, 0])
         self.hold(array("i", [0] * words))
 
     @classmethod

@@ -87,6 +87,7 @@ class Euler6(Attitude):
         if limit > 250000000:
             raise ValueError("bias_limit_dps is %r, expected 0..250 deg/s" % (bias_limit_dps,))
         Attitude.__init__(self, rate, gyro_scale, accel_lsb_per_g, words)
+        self.bias_set = [0, 0, 0]  # 1/256 counts
         s = self.state
         s[_LOW] = accel_lsb_per_g * accel_lsb_per_g >> 10  # (1/16 g)**2 / 4
         num, den = self.rate

@@ -14,30 +14,27 @@ from micropython import const
 
 from upright import fixmath
 from upright.attitude import Attitude, bias_of, hertz
-from upright.fixmath import turn
 
 # -- words of the state: written by tools/upright_host/words.py
 _PROBE = const(0)  # always -1, see fixmath.py
 _Q = const(1)  # 4, Q29: quaternion w x y z, body to earth
 _QR = const(5)  # 4, Q44: what rounding has left of it, 0..32767
-_W = const(9)  # 3, Q31: half the angle of this step, rad
 _WR = const(12)  # 3, Q46: what rounding has left of it, 0..32767
 _G = const(15)  # Q31: half angle per step of one gyro count
 _GR = const(16)  # Q46: its last bits, 0..32767
 _O = const(17)  # 3, Q31: minus the bias as a half angle per step
 _OR = const(20)  # 3, Q46: its last bits, -32767..32767
-_BASE = const(23)  # 3, Q8: gyro bias that was set, counts
-_O_BASE = const(26)  # 3, Q31: O of BASE alone
-_OR_BASE = const(29)  # 3, Q46: its last bits
-_B = const(32)  # 3: learnt bias on top of BASE, in the filter's own unit
-_TURN = const(35)  # 3, Q31: correction that the next step takes up, earth frame, half angle
-_R = const(38)  # 9, Q15: rotation matrix; its rows are north, west, up in the body
-_FORCE = const(47)  # 3, Q15: specific force of this sample in the earth frame, counts
+_TURN = const(23)  # 3, Q31: correction that the next step takes up, earth frame, half angle
+_R = const(26)  # 9, Q15: rotation matrix; its rows are north, west, up in the body
+_FORCE = const(35)  # 3, Q15: specific force of this sample in the earth frame, counts
+_BASE = const(38)  # 3, Q8: gyro bias that was set, counts
+_O_BASE = const(41)  # 3, Q31: O of BASE alone
+_OR_BASE = const(44)  # 3, Q46: its last bits
+_B = const(47)  # 3: learnt bias on top of BASE, in the filter's own unit
 _NINE = const(50)  # 1: use the magnetometer
 _BLOCK = const(51)  # log2 of the steps of a block
 _BLOCK_MASK = const(52)  # steps of a block less 1
 _PHASE = const(53)  # fresh steps of the block
-_GS = const(55)  # 3: gyro counts summed over the block
 _MS = const(58)  # 3, Q9: magnetometer in the earth frame, counts, summed over the block
 _MN = const(61)  # samples in it
 _SINCE = const(62)  # blocks since the last with a magnetometer sample, no more than 16
@@ -71,103 +68,64 @@ _ATAN = array("i", [
 
 # ------------------------------------------------------------------------------------------ every step
 @micropython.viper
-def advance(state, counts):
-    """Turn Q by the gyro; a fresh sample besides takes up TURN, renews R and FORCE and goes into the sums GS, MS, MN.
+def to_earth(s: ptr32, counts: ptr16):
+    """R of Q; FORCE, the specific force in the earth frame; a fresh magnetometer sample goes into the sum MS, MN.
 
     The accelerometer is taken as measured: neither normalised nor left out at full scale, so that what comes in swings
     cancels. A magnetometer sample is left out when all of it is zero or an axis is at full scale.
     """
-    s = ptr32(state)
-    c = ptr16(counts)
     k = 0
     if s[_PROBE] > 0:
         k = 32
-    # W = (gyro - bias) dt / 2
-    gain = s[_G]
-    fine = s[_GR]
-    n = ((c[3] & 0xFFFF) ^ 0x8000) - 0x8000
-    x = (s[_O] << k >> k) + n * gain
-    u = (s[_OR] << k >> k) + n * fine + s[_WR]
-    m = ((c[4] & 0xFFFF) ^ 0x8000) - 0x8000
-    y = (s[_O + 1] << k >> k) + m * gain
-    v = (s[_OR + 1] << k >> k) + m * fine + s[_WR + 1]
-    o = ((c[5] & 0xFFFF) ^ 0x8000) - 0x8000
-    z = (s[_O + 2] << k >> k) + o * gain
-    w = (s[_OR + 2] << k >> k) + o * fine + s[_WR + 2]
-    fresh = c[10] & 1
-    if fresh:
-        s[_GS] = (s[_GS] << k >> k) + n
-        s[_GS + 1] = (s[_GS + 1] << k >> k) + m
-        s[_GS + 2] = (s[_GS + 2] << k >> k) + o
-        if s[_TURN] | s[_TURN + 1] | s[_TURN + 2]:
-            # W += R' TURN, from the earth into the body
-            i = 0
-            r = _R
-            while i < 3:
-                n = s[_TURN + i] << k >> k
-                s[_TURN + i] = 0
-                m = (n + 16384) >> 15
-                n -= m << 15
-                o = s[r] << k >> k
-                x += o * m + (o * n + 16384 >> 15)
-                o = s[r + 1] << k >> k
-                y += o * m + (o * n + 16384 >> 15)
-                o = s[r + 2] << k >> k
-                z += o * m + (o * n + 16384 >> 15)
-                r += 3
-                i += 1
-    s[_WR] = u & 32767
-    s[_W] = x + (u >> 15)
-    s[_WR + 1] = v & 32767
-    s[_W + 1] = y + (v >> 15)
-    s[_WR + 2] = w & 32767
-    s[_W + 2] = z + (w >> 15)
-    turn(state)
-    if fresh:
-        # R of Q = (a, b, c, d), row by row; FORCE = R accel
-        u = ((s[_Q] << k >> k) + 8192) >> 14
-        v = ((s[_Q + 1] << k >> k) + 8192) >> 14
-        w = ((s[_Q + 2] << k >> k) + 8192) >> 14
-        r = ((s[_Q + 3] << k >> k) + 8192) >> 14
-        x = ((c[0] & 0xFFFF) ^ 0x8000) - 0x8000
-        y = ((c[1] & 0xFFFF) ^ 0x8000) - 0x8000
-        z = ((c[2] & 0xFFFF) ^ 0x8000) - 0x8000
-        m = 32768 - ((w * w + r * r + 8192) >> 14)
-        n = (v * w - u * r + 8192) >> 14
-        o = (v * r + u * w + 8192) >> 14
-        s[_R] = m
-        s[_R + 1] = n
-        s[_R + 2] = o
-        s[_FORCE] = m * x + n * y + o * z
-        m = (v * w + u * r + 8192) >> 14
-        n = 32768 - ((v * v + r * r + 8192) >> 14)
-        o = (w * r - u * v + 8192) >> 14
-        s[_R + 3] = m
-        s[_R + 4] = n
-        s[_R + 5] = o
-        s[_FORCE + 1] = m * x + n * y + o * z
-        m = (v * r - u * w + 8192) >> 14
-        n = (w * r + u * v + 8192) >> 14
-        o = 32768 - ((v * v + w * w + 8192) >> 14)
-        s[_R + 6] = m
-        s[_R + 7] = n
-        s[_R + 8] = o
-        s[_FORCE + 2] = m * x + n * y + o * z
-        if c[10] & 2 and s[_NINE]:
-            # MS += R mag
-            x = ((c[6] & 0xFFFF) ^ 0x8000) - 0x8000
-            y = ((c[7] & 0xFFFF) ^ 0x8000) - 0x8000
-            z = ((c[8] & 0xFFFF) ^ 0x8000) - 0x8000
-            full = x > 32766 or y > 32766 or z > 32766 or x < -32766 or y < -32766 or z < -32766
-            if (x | y | z) and not full:
-                s[_MN] += 1
-                i = 0
-                r = _R
-                while i < 3:
-                    n = (s[r] << k >> k) * x + (s[r + 1] << k >> k) * y + (s[r + 2] << k >> k) * z
-                    s[_MS + i] = (s[_MS + i] << k >> k) + ((n + 32) >> 6)
-                    r += 3
-                    i += 1
+    a = ((s[_Q] << k >> k) + 8192) >> 14
+    b = ((s[_Q + 1] << k >> k) + 8192) >> 14
+    c = ((s[_Q + 2] << k >> k) + 8192) >> 14
+    d = ((s[_Q + 3] << k >> k) + 8192) >> 14
+    x = ((counts[0] & 0xFFFF) ^ 0x8000) - 0x8000
+    y = ((counts[1] & 0xFFFF) ^ 0x8000) - 0x8000
+    z = ((counts[2] & 0xFFFF) ^ 0x8000) - 0x8000
+    # north: 1 - 2 (c c + d d), 2 (b c - a d), 2 (b d + a c); FORCE = R accel
+    m = 32768 - ((c * c + d * d + 8192) >> 14)
+    n = (b * c - a * d + 8192) >> 14
+    o = (b * d + a * c + 8192) >> 14
+    s[_R] = m
+    s[_R + 1] = n
+    s[_R + 2] = o
+    s[_FORCE] = m * x + n * y + o * z
+    # west
+    m = (b * c + a * d + 8192) >> 14
+    n = 32768 - ((b * b + d * d + 8192) >> 14)
+    o = (c * d - a * b + 8192) >> 14
+    s[_R + 3] = m
+    s[_R + 4] = n
+    s[_R + 5] = o
+    s[_FORCE + 1] = m * x + n * y + o * z
+    # up
+    m = (b * d - a * c + 8192) >> 14
+    n = (c * d + a * b + 8192) >> 14
+    o = 32768 - ((b * b + c * c + 8192) >> 14)
+    s[_R + 6] = m
+    s[_R + 7] = n
+    s[_R + 8] = o
+    s[_FORCE + 2] = m * x + n * y + o * z
+    if counts[10] & 2 == 0 or s[_NINE] == 0:
+        return
+    # MS += R mag
+    x = ((counts[6] & 0xFFFF) ^ 0x8000) - 0x8000
+    y = ((counts[7] & 0xFFFF) ^ 0x8000) - 0x8000
+    z = ((counts[8] & 0xFFFF) ^ 0x8000) - 0x8000
+    if (x | y | z) == 0:
+        return
+    if x > 32766 or y > 32766 or z > 32766 or x < -32766 or y < -32766 or z < -32766:
+        return
+    s[_MN] += 1
+    i = 0
+    a = _R
+    while i < 3:
+        n = (s[a] << k >> k) * x + (s[a + 1] << k >> k) * y + (s[a + 2] << k >> k) * z
+        s[_MS + i] = (s[_MS + i] << k >> k) + ((n + 32) >> 6)
+        a += 3
+        i += 1
 
 
 # ------------------------------------------------------------------------------------------ once a block
@@ -239,10 +197,10 @@ def compass(s: ptr32, at: int, half_turn: int):
 
 
 @micropython.viper
-def low_pass(s: ptr32, seen: int):
+def low_pass(s: ptr32, gyro: int):
     """LOW1 += k (IN - LOW1); LOW2 += k (LOW1 - LOW2); AWAY = |seen - LOW2|**2 of accelerometer and gyro.
 
-    seen: where the 6 values stand that are judged, as IN; no difference counts with more than 2048 counts.
+    seen: IN, but its gyro stands from word `gyro` on; no difference counts with more than 2048 counts.
     """
     k = 0
     if s[_PROBE] > 0:
@@ -253,6 +211,7 @@ def low_pass(s: ptr32, seen: int):
         s[_BLOCKS] = i
         gain = 32768 // i  # the mean of all, until the low-pass takes over
     total = 0
+    at = _IN
     i = 0
     while i < 6:
         f = s[_LOW1 + i] << k >> k
@@ -265,16 +224,18 @@ def low_pass(s: ptr32, seen: int):
         h = f >> 15
         v += h * gain + ((f - (h << 15)) * gain + 16384 >> 15)
         s[_LOW2 + i] = v
-        v = ((s[seen + i] << k >> k) - v) >> 9
+        v = ((s[at] << k >> k) - v) >> 9
         if v < 0:
             v = 0 - v
         if v > 16383:
             v = 16383
         total += v * v
+        at += 1
         i += 1
         if i == 3:
             s[_AWAY] = total
             total = 0
+            at = gyro
     s[_AWAY + 1] = total
 
 
@@ -284,20 +245,22 @@ class EarthFilter(Attitude):
 
     PARAMETERS             {name: (default, least, most)}, in s, rad, g, deg/s ...; taken to six significant digits
     start_at(q, known)     see Attitude; known: 1 tilt, 2 tilt and heading are those of a sample, 0: nothing is known
+    bounds(p)              the largest bias that is learnt, in 1e-6 deg/s, and what of 1 rad (Q31) corrections take
+    set_up(p, given)       the filter's own words; p: parameters in millionths; given: those that were given, as given
     bias_is_new(known_s)   a bias was set: forget what was learnt of it
     bias_unit              (num, den): gyro counts of one unit of B
     """
 
-    def __init__(self, rate, gyro_scale, accel_lsb_per_g, words, most_dps, room, parameters):
-        """Take rate, scales and parameters, or raise: `parameters` become millionths, in self.parameters.
+    def __init__(self, rate, gyro_scale, accel_lsb_per_g, words, parameters):
+        """Take rate, scales and parameters, or raise; then set_up(p, parameters), start level and know no bias.
 
-        most_dps(p): the largest bias that is learnt on top of set_bias, in millionths; room(p): what of 1 rad (Q31)
-        is kept for corrections.
+        p: the parameters in millionths, those that were not given by default.
+
         """
         Attitude.__init__(self, rate, gyro_scale, accel_lsb_per_g, words)
         s = self.state
         s[_NINE] = int(self.AXES == 9)
-        self.parameters = p = {}
+        p = {}
         for name in self.PARAMETERS:
             default, least, most = self.PARAMETERS[name]
             value = parameters.get(name, default)
@@ -322,8 +285,8 @@ class EarthFilter(Attitude):
         s[_BLOCK_MASK] = (1 << shift) - 1
         s[_PHASE] = 1  # the first block is a whole one for the gyro's mean
         # |W| < 1 rad with every axis at full scale against a bias of 8192 counts and the largest corrections
-        room = room(p)
-        counts_most = 32768 + 8192 + self.counts(most_dps(p), 1)
+        bias_most, room = self.bounds(p)
+        counts_most = 32768 + 8192 + self.counts(bias_most, 1)
         turn_most = (gain * counts_most >> 15) * 17321 // 10000
         if turn_most + room > _STEP_MAX or gain < 1 << 17:
             raise ValueError(
@@ -343,6 +306,9 @@ class EarthFilter(Attitude):
         s[_REST_AFTER] = max(1, self.blocks(p["rest_after"]))
         s[_REST_GYRO] = self.counts(p["rest_gyro_dps"], 8) ** 2
         s[_REST_ACCEL] = fixmath.ratio(p["rest_accel_g"] * 8 * accel_lsb_per_g, MILLION) ** 2
+        self.set_up(p, parameters)
+        self.set_bias(0, 0, 0)
+        self.start_at((fixmath.ONE, 0, 0, 0))
 
     def blocks(self, millionths, bits=0):
         """A time in us as blocks, Q(bits)."""
@@ -397,6 +363,7 @@ class EarthFilter(Attitude):
         for i in range(3):
             b = fixmath.ratio(bias[i] * gain, 256)
             change = (s[_BASE + i] - bias[i]) << 4
+            s[_IN + 3 + i] += change
             s[_LOW1 + 3 + i] += change
             s[_LOW2 + 3 + i] += change
             s[_BASE + i] = bias[i]

@@ -7,10 +7,10 @@ import micropython
 from micropython import const
 
 from upright import fixmath
-from upright.earth_kernels import MILLION, EarthFilter, advance, compass, fine_mantissa
+from upright.earth_kernels import MILLION, EarthFilter, compass, fine_mantissa, low_pass, to_earth
+from upright.fixmath import turn
 from upright.inertial_kernels import (
     detect_rest,
-    inform,
     judge_field,
     learn,
     level,
@@ -21,76 +21,87 @@ from upright.inertial_kernels import (
 )
 
 # -- words of the state: written by tools/upright_host/words.py
+_PROBE = const(0)
+_W = const(9)
+_WR = const(12)
 _G = const(15)
 _GR = const(16)
+_O = const(17)
+_OR = const(20)
+_TURN = const(23)
+_R = const(26)
+_BASE = const(38)
 _NINE = const(50)
 _BLOCK = const(51)
 _BLOCK_MASK = const(52)
 _PHASE = const(53)
+_GS = const(55)
 _MS = const(58)
 _SINCE = const(62)
 _J = const(63)
+_IN = const(67)
 _REST_MOST = const(93)
-_S = const(100)
-_N = const(109)
-_N_RAMP = const(110)
-_N_LATE = const(111)
-_N_END = const(112)
-_LATE = const(113)
-_RAMP = const(114)
-_K_END = const(115)
-_K_END_SHIFT = const(116)
-_NORM = const(117)
-_G1 = const(118)
-_LI = const(119)
-_OM_GAIN = const(120)
-_X = const(121)
-_OM = const(137)
-_U = const(138)
-_INFO = const(141)
-_II = const(144)
-_INFO_LEAST = const(147)
-_INFO_KNOWN = const(148)
-_INFO_DECAY = const(149)
-_RATE_T = const(150)
-_REST_OFF = const(151)
-_UPSET = const(152)
-_B_SHIFT = const(153)
-_B_MAX = const(154)
-_C = const(155)
-_CC = const(158)
-_CC_SHIFT = const(159)
-_TURN_MAX = const(160)
-_REJECTED = const(170)
-_WEIGHT = const(171)
-_TOL = const(172)
-_SMOOTH = const(173)
-_REF = const(174)
-_FIELD_AFTER = const(175)
-_FIELD_FIRST = const(176)
-_FIELD_NEW = const(177)
-_REJECT_FOR = const(178)
-_TURNING_MIN = const(179)
-_AGREE = const(180)
-_HN = const(181)
-_LOST = const(182)
-_FAR_MIN = const(183)
-_RESTART_AFTER = const(184)
-_HRAMP = const(185)
-_HK = const(186)
-_HK_DOUBT = const(187)
-_LIMIT_AFTER = const(188)
-_PUSH = const(189)
-_ZK = const(190)
-_PUSH_MAX = const(191)
-_HC = const(192)
-_HC_SHIFT = const(193)
-_DOUBT = const(194)
-_DOUBT_RATE = const(195)
-_LITE = const(196)
-_GAP = const(197)
-_OUTAGE = const(198)
-_WORDS = const(199)
+_SEEN = const(94)
+_S = const(97)
+_N = const(106)
+_N_RAMP = const(107)
+_N_LATE = const(108)
+_N_END = const(109)
+_LATE = const(110)
+_RAMP = const(111)
+_K_END = const(112)
+_K_END_SHIFT = const(113)
+_NORM = const(114)
+_G1 = const(115)
+_LI = const(116)
+_OM_GAIN = const(117)
+_X = const(118)
+_OM = const(134)
+_U = const(135)
+_INFO = const(138)
+_II = const(141)
+_INFO_LEAST = const(144)
+_INFO_KNOWN = const(145)
+_INFO_DECAY = const(146)
+_RATE_T = const(147)
+_REST_OFF = const(148)
+_UPSET = const(149)
+_B_SHIFT = const(150)
+_B_MAX = const(151)
+_C = const(152)
+_CC = const(155)
+_CC_SHIFT = const(156)
+_TURN_MAX = const(157)
+_REJECTED = const(167)
+_WEIGHT = const(168)
+_TOL = const(169)
+_SMOOTH = const(170)
+_REF = const(171)
+_FIELD_AFTER = const(172)
+_FIELD_FIRST = const(173)
+_FIELD_NEW = const(174)
+_REJECT_FOR = const(175)
+_TURNING_MIN = const(176)
+_AGREE = const(177)
+_HN = const(178)
+_LOST = const(179)
+_FAR_MIN = const(180)
+_RESTART_AFTER = const(181)
+_HRAMP = const(182)
+_HK = const(183)
+_HK_DOUBT = const(184)
+_LIMIT_AFTER = const(185)
+_PUSH = const(186)
+_ZK = const(187)
+_PUSH_MAX = const(188)
+_HC = const(189)
+_HC_SHIFT = const(190)
+_DOUBT = const(191)
+_DOUBT_RATE = const(192)
+_LITE = const(193)
+_GAP = const(194)
+_OUTAGE = const(195)
+_WORDS = const(196)
 # -- end of the words
 
 _PI28 = const(843314857)  # pi, Q28
@@ -174,15 +185,79 @@ class Inertial9(EarthFilter):
     }
 
     def __init__(self, rate, gyro_scale, accel_lsb_per_g, **parameters):
-        EarthFilter.__init__(
-            self, rate, gyro_scale, accel_lsb_per_g, _WORDS, _bias_most, _corrections, parameters
-        )
-        self.state[_LITE] = int(self.LITE)
-        _set_up(self)
-        self.set_bias(0, 0, 0)
-        self.start_at((fixmath.ONE, 0, 0, 0))
+        EarthFilter.__init__(self, rate, gyro_scale, accel_lsb_per_g, _WORDS, parameters)
 
-    # -- set-up and main loop
+    # -- set-up and main loop: allocates
+    def bounds(self, p):
+        # of the tilt, and 0.25 rad of the heading
+        ramp_q8 = fixmath.ratio(p["ramp_tilt"] * 256, MILLION)
+        tilt = fixmath.ratio((1 << 31) * 256 * 14143, (ramp_q8 + 512) * 20000)
+        return p["bias_limit_dps"], tilt + (1 << 29)
+
+    def set_up(self, p, given):
+        s, lsb = self.state, self.accel_lsb_per_g
+        s[_LITE] = int(self.LITE)
+        whole, counts, ratio = self.blocks, self.counts, fixmath.ratio
+        num, den = self.rate
+        scale, per = self.gyro_scale
+        gain = (s[_G] << 15) + s[_GR]
+        t = den << s[_BLOCK]  # a block lasts t / num s
+        if counts(p["field_dps"], 1) > 4000:
+            raise ValueError("gyro_scale is %d/%d, too fine for field_dps" % self.gyro_scale)
+        # levelling
+        s[_RAMP] = ramp_q8 = ratio(p["ramp_tilt"] * 256, MILLION)
+        s[_K_END], s[_K_END_SHIFT] = fine_mantissa(den * MILLION, num * p["tau_tilt"], 15)
+        s[_N_RAMP] = -(-(p["tau_tilt"] * num * 256 // (MILLION * den) - 512) // ramp_q8)
+        s[_N_LATE] = ratio(p["bias_after"] * num, MILLION * den)
+        s[_OUTAGE] = max(1, ratio(p["outage"] * num, MILLION * den))
+        s[_N_END] = max(s[_N_RAMP], s[_N_LATE] + 1)
+        while lsb << s[_NORM] < 1 << 14:
+            s[_NORM] += 1
+        g1 = lsb << s[_NORM]
+        s[_G1] = lsb
+        s[_LI] = ratio(1 << 29, g1)
+        s[_OM_GAIN] = ratio(10 << 24, 3 * g1)
+        # rest
+        s[_REST_MOST] = counts(p["bias_limit_dps"], 4096)
+        s[_REST_OFF] = counts(p["rest_dps"], 4096)
+        s[_UPSET] = ratio(p["upset_g"] * lsb, 4 * MILLION) ** 2
+        # bias
+        s[_B_SHIFT] = 20
+        while counts(p["bias_limit_dps"], 1 << s[_B_SHIFT]) >= 1 << 30:
+            s[_B_SHIFT] -= 1
+        s[_B_MAX] = counts(p["bias_limit_dps"], 1 << s[_B_SHIFT])
+        s[_CC], s[_CC_SHIFT] = fine_mantissa(1 << 27, gain, 14)
+        s[_TURN_MAX] = gain >> 3
+        s[_INFO_KNOWN] = ratio(20 * num << 14, t)
+        s[_INFO_LEAST] = ratio(num << 14, t)
+        s[_INFO_DECAY] = ratio(t << 22, 150 * num)
+        s[_RATE_T] = ratio(num << 4, t)
+        # field
+        s[_REJECTED] = s[_REJECT_FOR] = whole(p["reject_for"])
+        s[_TOL] = ratio(p["field_tolerance"] ** 2 << 15, MILLION**2)
+        s[_SMOOTH] = whole(50000, 10)
+        s[_REF] = whole(p["field_tau"], 10)
+        s[_FIELD_AFTER] = max(1, whole(p["field_after"]))
+        s[_FIELD_FIRST] = whole(p["field_first"])
+        s[_FIELD_NEW] = whole(p["field_new"])
+        s[_TURNING_MIN] = counts(p["field_dps"], 4) ** 2
+        s[_AGREE] = ratio(p["field_agree"] << 28, MILLION)
+        # heading
+        s[_FAR_MIN] = ratio(p["restart_rad"] << 28, MILLION)
+        s[_RESTART_AFTER] = whole(p["restart_after"])
+        s[_HRAMP] = ratio(p["ramp_heading"] * 256, MILLION)
+        s[_HK] = ratio(t * MILLION << 22, p["tau_heading"] * num)
+        s[_HK_DOUBT] = ratio(t * MILLION << 22, p["tau_doubt"] * num)
+        s[_LIMIT_AFTER] = ratio(10 * num, t)
+        s[_WEIGHT] = 2 if s[_LITE] else 0
+        rad = fixmath.PI_NUM * t  # of a deg/s in a block: rad / (180 PI_DEN num)
+        s[_PUSH_MAX] = ratio(3 * rad << 28, 180 * fixmath.PI_DEN * num)
+        # with the 8 bits of the split
+        s[_HC], s[_HC_SHIFT] = fine_mantissa(180 * fixmath.PI_DEN * num * scale, rad * per << 8, 14)
+        s[_DOUBT_RATE] = ratio(
+            p["bias_limit_dps"] * rad << 20, 180 * MILLION * fixmath.PI_DEN * num
+        )
+
     def start_at(self, q, known=0):
         EarthFilter.start_at(self, q)
         s = self.state
@@ -235,10 +310,52 @@ class Inertial9(EarthFilter):
         of the steps' will do. Bits 2 and 3 (full scale) change nothing: to leave such samples out would be worse.
         """
         state = self.state
-        advance(state, counts)
         s = ptr32(state)
         c = ptr16(counts)
-        if c[10] & 1 == 0:
+        k = 0
+        if s[_PROBE] > 0:
+            k = 32
+        # W = (gyro - bias) dt / 2
+        gain = s[_G]
+        fine = s[_GR]
+        n = ((c[3] & 0xFFFF) ^ 0x8000) - 0x8000
+        x = (s[_O] << k >> k) + n * gain
+        u = (s[_OR] << k >> k) + n * fine + s[_WR]
+        m = ((c[4] & 0xFFFF) ^ 0x8000) - 0x8000
+        y = (s[_O + 1] << k >> k) + m * gain
+        v = (s[_OR + 1] << k >> k) + m * fine + s[_WR + 1]
+        o = ((c[5] & 0xFFFF) ^ 0x8000) - 0x8000
+        z = (s[_O + 2] << k >> k) + o * gain
+        w = (s[_OR + 2] << k >> k) + o * fine + s[_WR + 2]
+        fresh = c[10] & 1
+        if fresh:
+            s[_GS] = (s[_GS] << k >> k) + n
+            s[_GS + 1] = (s[_GS + 1] << k >> k) + m
+            s[_GS + 2] = (s[_GS + 2] << k >> k) + o
+            # + R' TURN, the last correction, from the earth into the body
+            i = 0
+            r = _R
+            while i < 3:
+                n = s[_TURN + i] << k >> k
+                s[_TURN + i] = 0
+                m = (n + 16384) >> 15
+                n -= m << 15
+                o = s[r] << k >> k
+                x += o * m + (o * n + 16384 >> 15)
+                o = s[r + 1] << k >> k
+                y += o * m + (o * n + 16384 >> 15)
+                o = s[r + 2] << k >> k
+                z += o * m + (o * n + 16384 >> 15)
+                r += 3
+                i += 1
+        s[_WR] = u & 32767
+        s[_W] = x + (u >> 15)
+        s[_WR + 1] = v & 32767
+        s[_W + 1] = y + (v >> 15)
+        s[_WR + 2] = w & 32767
+        s[_W + 2] = z + (w >> 15)
+        turn(state)
+        if fresh == 0:
             if s[_GAP] < s[_OUTAGE]:
                 s[_GAP] += 1
         else:
@@ -249,11 +366,25 @@ class Inertial9(EarthFilter):
                 s[_GAP] = 0
             if s[_N] < s[_N_END]:
                 ramp(state)
+            to_earth(state, counts)
             level(state)
             i = s[_PHASE]
             s[_PHASE] = (i + 1) & s[_BLOCK_MASK]
             if i == 0:
-                detect_rest(state, counts)
+                # what the rest detector is given: sample and block mean, less the bias that was set
+                fine = 12 - s[_BLOCK]
+                i = 0
+                while i < 3:
+                    n = ((c[i] & 0xFFFF) ^ 0x8000) - 0x8000
+                    s[_IN + i] = n << 12
+                    m = (s[_BASE + i] << k >> k) << 4
+                    n = ((c[3 + i] & 0xFFFF) ^ 0x8000) - 0x8000
+                    s[_SEEN + i] = (n << 12) - m
+                    s[_IN + 3 + i] = ((s[_GS + i] << k >> k) << fine) - m
+                    s[_GS + i] = 0
+                    i += 1
+                low_pass(state, _SEEN)
+                detect_rest(state)
             elif i == 1:
                 regress(state)
             elif i == 2:
@@ -264,12 +395,10 @@ class Inertial9(EarthFilter):
                     judge_field(state)
                 if s[_BLOCK] == 2:  # a block of four steps: the rest of it as well
                     steer(state)
-                    inform(state)
                     learn(state)
             elif i == 4:
                 steer(state)
             elif i == 5:
-                inform(state)
                 learn(state)
 
 
@@ -289,77 +418,3 @@ class Inertial6(Inertial9):
     AXES = 6
 
     update = Inertial9.update  # see attitude.py
-
-
-# ----------------------------------------------------------------------------- set-up: allocates
-def _bias_most(p):
-    return p["bias_limit_dps"]
-
-
-def _corrections(p):
-    """The largest turn that a step takes up, half angle, Q31: of the tilt, and 0.25 rad of the heading."""
-    ramp_q8 = fixmath.ratio(p["ramp_tilt"] * 256, MILLION)
-    return fixmath.ratio((1 << 31) * 256 * 14143, (ramp_q8 + 512) * 20000) + (1 << 29)
-
-
-def _set_up(filter):
-    """Turn rate, scales and parameters into the state's words, in integers throughout."""
-    s, p, lsb = filter.state, filter.parameters, filter.accel_lsb_per_g
-    whole, counts, ratio = filter.blocks, filter.counts, fixmath.ratio
-    num, den = filter.rate
-    scale, per = filter.gyro_scale
-    gain = (s[_G] << 15) + s[_GR]
-    t = den << s[_BLOCK]  # a block lasts t / num s
-    if counts(p["field_dps"], 1) > 4000:
-        raise ValueError("gyro_scale is %d/%d, too fine for field_dps" % filter.gyro_scale)
-    # levelling
-    s[_RAMP] = ramp_q8 = ratio(p["ramp_tilt"] * 256, MILLION)
-    s[_K_END], s[_K_END_SHIFT] = fine_mantissa(den * MILLION, num * p["tau_tilt"], 15)
-    s[_N_RAMP] = -(-(p["tau_tilt"] * num * 256 // (MILLION * den) - 512) // ramp_q8)
-    s[_N_LATE] = ratio(p["bias_after"] * num, MILLION * den)
-    s[_OUTAGE] = max(1, ratio(p["outage"] * num, MILLION * den))
-    s[_N_END] = max(s[_N_RAMP], s[_N_LATE] + 1)
-    while lsb << s[_NORM] < 1 << 14:
-        s[_NORM] += 1
-    g1 = lsb << s[_NORM]
-    s[_G1] = lsb
-    s[_LI] = ratio(1 << 29, g1)
-    s[_OM_GAIN] = ratio(10 << 24, 3 * g1)
-    # rest
-    s[_REST_MOST] = counts(p["bias_limit_dps"], 4096)
-    s[_REST_OFF] = counts(p["rest_dps"], 4096)
-    s[_UPSET] = ratio(p["upset_g"] * lsb, 4 * MILLION) ** 2
-    # bias
-    s[_B_SHIFT] = 20
-    while counts(p["bias_limit_dps"], 1 << s[_B_SHIFT]) >= 1 << 30:
-        s[_B_SHIFT] -= 1
-    s[_B_MAX] = counts(p["bias_limit_dps"], 1 << s[_B_SHIFT])
-    s[_CC], s[_CC_SHIFT] = fine_mantissa(1 << 27, gain, 14)
-    s[_TURN_MAX] = gain >> 3
-    s[_INFO_KNOWN] = ratio(20 * num << 14, t)
-    s[_INFO_LEAST] = ratio(num << 14, t)
-    s[_INFO_DECAY] = ratio(t << 22, 150 * num)
-    s[_RATE_T] = ratio(num << 4, t)
-    # field
-    s[_REJECTED] = s[_REJECT_FOR] = whole(p["reject_for"])
-    s[_TOL] = ratio(p["field_tolerance"] ** 2 << 15, MILLION**2)
-    s[_SMOOTH] = whole(50000, 10)
-    s[_REF] = whole(p["field_tau"], 10)
-    s[_FIELD_AFTER] = max(1, whole(p["field_after"]))
-    s[_FIELD_FIRST] = whole(p["field_first"])
-    s[_FIELD_NEW] = whole(p["field_new"])
-    s[_TURNING_MIN] = counts(p["field_dps"], 4) ** 2
-    s[_AGREE] = ratio(p["field_agree"] << 28, MILLION)
-    # heading
-    s[_FAR_MIN] = ratio(p["restart_rad"] << 28, MILLION)
-    s[_RESTART_AFTER] = whole(p["restart_after"])
-    s[_HRAMP] = ratio(p["ramp_heading"] * 256, MILLION)
-    s[_HK] = ratio(t * MILLION << 22, p["tau_heading"] * num)
-    s[_HK_DOUBT] = ratio(t * MILLION << 22, p["tau_doubt"] * num)
-    s[_LIMIT_AFTER] = ratio(10 * num, t)
-    s[_WEIGHT] = 2 if s[_LITE] else 0
-    rad = fixmath.PI_NUM * t  # of a deg/s in a block: rad / (180 PI_DEN num)
-    s[_PUSH_MAX] = ratio(3 * rad << 28, 180 * fixmath.PI_DEN * num)
-    # with the 8 bits of the split
-    s[_HC], s[_HC_SHIFT] = fine_mantissa(180 * fixmath.PI_DEN * num * scale, rad * per << 8, 14)
-    s[_DOUBT_RATE] = ratio(p["bias_limit_dps"] * rad << 20, 180 * MILLION * fixmath.PI_DEN * num)

@@ -6,28 +6,24 @@
 import micropython
 from micropython import const
 
-from upright.earth_kernels import low_pass
-
 # -- words of the state: written by tools/upright_host/words.py
 _PROBE = const(0)  # always -1, see fixmath.py
 _G = const(15)  # Q31: half angle per step of one gyro count
 _GR = const(16)  # Q46: its last bits, 0..32767
 _O = const(17)  # 3, Q31: minus the bias as a half angle per step
 _OR = const(20)  # 3, Q46: its last bits, -32767..32767
-_BASE = const(23)  # 3, Q8: gyro bias that was set, counts
-_O_BASE = const(26)  # 3, Q31: O of BASE alone
-_OR_BASE = const(29)  # 3, Q46: its last bits
-_B = const(32)  # 3: learnt bias on top of BASE, in the filter's own unit
-_TURN = const(35)  # 3, Q31: correction that the next step takes up, earth frame, half angle
-_R = const(38)  # 9, Q15: rotation matrix; its rows are north, west, up in the body
-_FORCE = const(47)  # 3, Q15: specific force of this sample in the earth frame, counts
+_TURN = const(23)  # 3, Q31: correction that the next step takes up, earth frame, half angle
+_R = const(26)  # 9, Q15: rotation matrix; its rows are north, west, up in the body
+_FORCE = const(35)  # 3, Q15: specific force of this sample in the earth frame, counts
+_BASE = const(38)  # 3, Q8: gyro bias that was set, counts
+_O_BASE = const(41)  # 3, Q31: O of BASE alone
+_OR_BASE = const(44)  # 3, Q46: its last bits
+_B = const(47)  # 3: learnt bias on top of BASE, in the filter's own unit
 _BLOCK = const(51)  # log2 of the steps of a block
 _DECIDED = const(54)  # yes/no decisions, for the tests' float twin
-_GS = const(55)  # 3: gyro counts summed over the block
 _J = const(63)  # blocks that the heading of this block stands for; 0: none
 _HEADING = const(64)  # Q28: heading error, rad
 _NOW = const(65)  # 2, Q13: horizontal and vertical field, counts
-_IN = const(67)  # 6, Q12: what LOW1 takes up: accelerometer, gyro less BASE, counts
 _LOW2 = const(79)  # 6, Q12: second
 _AWAY = const(85)  # 2, Q6: squared distance from LOW2 of accelerometer and gyro, counts**2
 _STILL = const(88)  # blocks without motion, no more than REST_AFTER
@@ -35,77 +31,76 @@ _REST_AFTER = const(89)  # blocks
 _REST_GYRO = const(91)  # Q6: at rest AWAY is less: counts**2
 _REST_ACCEL = const(92)  # Q6: the same of the accelerometer
 _REST_MOST = const(93)  # Q12: most that is taken for a bias, counts
-_SEEN = const(94)  # 6, Q12: as IN, but the gyro of this one sample
-_S = const(100)  # 3, Q14: low-passed specific force in the earth frame, counts
-_OFF = const(103)  # 2, Q14: its last sample less the low-pass, horizontal, counts
-_K = const(105)  # tilt gain times dt = K / 2**K_SHIFT, K < 2**15
-_K_SHIFT = const(106)
-_KC = const(107)  # the same for S (normalised) to half angle
-_KC_SHIFT = const(108)
-_N = const(109)  # fresh steps since the start of the ramp, no more than N_END
-_N_RAMP = const(110)  # steps of the ramp
-_N_LATE = const(111)  # steps until the bias is estimated in motion
-_LATE = const(113)  # 1: the bias is estimated in motion
-_RAMP = const(114)  # Q8: ramp of the tilt
-_K_END = const(115)  # K after the ramp
-_K_END_SHIFT = const(116)
-_NORM = const(117)  # shift that brings 1 g to 2**14..2**15 counts
-_G1 = const(118)  # 1 g in counts
-_LI = const(119)  # Q29: 1 / (1 g, normalised)
-_OM_GAIN = const(120)  # Q24: 1 / (0.3 g, normalised)
-_X = const(121)  # 6, Q24: regressors north and west: inner low-pass
-_Y = const(127)  # 6, Q24: outer low-pass
-_Z = const(133)  # 3, Q24: regressor up
-_D = const(136)  # Q15: square of the horizontal deviation / (0.3 g)**2
-_OM = const(137)  # Q15: tilt confidence 1 / (1 + D)
-_U = const(138)  # 3, Q15: what the block tells about the bias, counts
-_INFO = const(141)  # 3, Q14: information about it, blocks
-_II = const(144)  # 3, Q20: 1 / information in seconds
-_INFO_LEAST = const(147)  # Q14: first information, blocks
-_INFO_KNOWN = const(148)  # Q14: with more the bias is well known, blocks
-_INFO_DECAY = const(149)  # Q22: 1 / blocks of 150 s
-_RATE_T = const(150)  # Q4: blocks a second
-_REST_OFF = const(151)  # Q12: most that a known bias may be off, counts
-_UPSET = const(152)  # tilt at rest that restarts the ramps: (counts / 4)**2
-_B_SHIFT = const(153)  # B is in counts, Q(B_SHIFT)
-_B_MAX = const(154)  # its bound
-_C = const(155)  # 3, Q12: correction (north, west; up) in counts
-_CC = const(158)  # half angle (Q31) to counts (Q12): CC / 2**CC_SHIFT
-_CC_SHIFT = const(159)
-_TURN_MAX = const(160)  # Q31: 4096 counts as a half angle
-_HAVE = const(161)  # 1: field and candidate are set; 2: reference, too
-_F = const(162)  # 2, Q13: smoothed field, counts
-_FR = const(164)  # 2, Q13: reference; F, FR and FC stand together
-_FC = const(166)  # 2, Q13: candidate
-_NEAR = const(168)  # blocks near the reference, no more than FIELD_AFTER
-_CAND = const(169)  # blocks near the candidate
-_REJECTED = const(170)  # blocks
-_WEIGHT = const(171)  # of the heading, in halves: 2 accepted, 1 after a long rejection, 0
-_TOL = const(172)  # Q15: tolerance squared
-_SMOOTH = const(173)  # Q10: blocks of 0.05 s
-_REF = const(174)  # Q10: blocks of the reference's time constant
-_FIELD_AFTER = const(175)  # blocks
-_FIELD_FIRST = const(176)  # blocks
-_FIELD_NEW = const(177)  # blocks
-_REJECT_FOR = const(178)  # blocks
-_TURNING_MIN = const(179)  # Q4: counts**2
-_AGREE = const(180)  # Q28: rad
-_HN = const(181)  # blocks since the start of the heading's ramp
-_LOST = const(182)  # blocks of large heading error
-_FAR_MIN = const(183)  # Q28: rad
-_RESTART_AFTER = const(184)  # blocks
-_HRAMP = const(185)  # Q8: ramp of the heading
-_HK = const(186)  # Q22: heading gain of a block
-_HK_DOUBT = const(187)  # Q22: the same where 1 / information is 1
-_LIMIT_AFTER = const(188)  # blocks
-_PUSH = const(189)  # Q28: heading correction of one block, rad
-_ZK = const(190)  # Q22: gain of it
-_PUSH_MAX = const(191)  # Q28: bound of it for the bias, rad
-_HC = const(192)  # PUSH to counts, Q12: HC / 2**(HC_SHIFT + 8)
-_HC_SHIFT = const(193)
-_DOUBT = const(194)  # Q28: heading uncertainty, rad
-_DOUBT_RATE = const(195)  # Q20: its growth in a block where 1 / information is 1, rad
-_LITE = const(196)  # 1: no field rejection, no restart of the heading
+_S = const(97)  # 3, Q14: low-passed specific force in the earth frame, counts
+_OFF = const(100)  # 2, Q14: its last sample less the low-pass, horizontal, counts
+_K = const(102)  # tilt gain times dt = K / 2**K_SHIFT, K < 2**15
+_K_SHIFT = const(103)
+_KC = const(104)  # the same for S (normalised) to half angle
+_KC_SHIFT = const(105)
+_N = const(106)  # fresh steps since the start of the ramp, no more than N_END
+_N_RAMP = const(107)  # steps of the ramp
+_N_LATE = const(108)  # steps until the bias is estimated in motion
+_LATE = const(110)  # 1: the bias is estimated in motion
+_RAMP = const(111)  # Q8: ramp of the tilt
+_K_END = const(112)  # K after the ramp
+_K_END_SHIFT = const(113)
+_NORM = const(114)  # shift that brings 1 g to 2**14..2**15 counts
+_G1 = const(115)  # 1 g in counts
+_LI = const(116)  # Q29: 1 / (1 g, normalised)
+_OM_GAIN = const(117)  # Q24: 1 / (0.3 g, normalised)
+_X = const(118)  # 6, Q24: regressors north and west: inner low-pass
+_Y = const(124)  # 6, Q24: outer low-pass
+_Z = const(130)  # 3, Q24: regressor up
+_D = const(133)  # Q15: square of the horizontal deviation / (0.3 g)**2
+_OM = const(134)  # Q15: tilt confidence 1 / (1 + D)
+_U = const(135)  # 3, Q15: what the block tells about the bias, counts
+_INFO = const(138)  # 3, Q14: information about it, blocks
+_II = const(141)  # 3, Q20: 1 / information in seconds
+_INFO_LEAST = const(144)  # Q14: first information, blocks
+_INFO_KNOWN = const(145)  # Q14: with more the bias is well known, blocks
+_INFO_DECAY = const(146)  # Q22: 1 / blocks of 150 s
+_RATE_T = const(147)  # Q4: blocks a second
+_REST_OFF = const(148)  # Q12: most that a known bias may be off, counts
+_UPSET = const(149)  # tilt at rest that restarts the ramps: (counts / 4)**2
+_B_SHIFT = const(150)  # B is in counts, Q(B_SHIFT)
+_B_MAX = const(151)  # its bound
+_C = const(152)  # 3, Q12: correction (north, west; up) in counts
+_CC = const(155)  # half angle (Q31) to counts (Q12): CC / 2**CC_SHIFT
+_CC_SHIFT = const(156)
+_TURN_MAX = const(157)  # Q31: 4096 counts as a half angle
+_HAVE = const(158)  # 1: field and candidate are set; 2: reference, too
+_F = const(159)  # 2, Q13: smoothed field, counts
+_FR = const(161)  # 2, Q13: reference; F, FR and FC stand together
+_FC = const(163)  # 2, Q13: candidate
+_NEAR = const(165)  # blocks near the reference, no more than FIELD_AFTER
+_CAND = const(166)  # blocks near the candidate
+_REJECTED = const(167)  # blocks
+_WEIGHT = const(168)  # of the heading, in halves: 2 accepted, 1 after a long rejection, 0
+_TOL = const(169)  # Q15: tolerance squared
+_SMOOTH = const(170)  # Q10: blocks of 0.05 s
+_REF = const(171)  # Q10: blocks of the reference's time constant
+_FIELD_AFTER = const(172)  # blocks
+_FIELD_FIRST = const(173)  # blocks
+_FIELD_NEW = const(174)  # blocks
+_REJECT_FOR = const(175)  # blocks
+_TURNING_MIN = const(176)  # Q4: counts**2
+_AGREE = const(177)  # Q28: rad
+_HN = const(178)  # blocks since the start of the heading's ramp
+_LOST = const(179)  # blocks of large heading error
+_FAR_MIN = const(180)  # Q28: rad
+_RESTART_AFTER = const(181)  # blocks
+_HRAMP = const(182)  # Q8: ramp of the heading
+_HK = const(183)  # Q22: heading gain of a block
+_HK_DOUBT = const(184)  # Q22: the same where 1 / information is 1
+_LIMIT_AFTER = const(185)  # blocks
+_PUSH = const(186)  # Q28: heading correction of one block, rad
+_ZK = const(187)  # Q22: gain of it
+_PUSH_MAX = const(188)  # Q28: bound of it for the bias, rad
+_HC = const(189)  # PUSH to counts, Q12: HC / 2**(HC_SHIFT + 8)
+_HC_SHIFT = const(190)
+_DOUBT = const(191)  # Q28: heading uncertainty, rad
+_DOUBT_RATE = const(192)  # Q20: its growth in a block where 1 / information is 1, rad
+_LITE = const(193)  # 1: no field rejection, no restart of the heading
 # -- end of the words
 
 _STILL_BIT = const(1)
@@ -161,24 +156,29 @@ def level(s: ptr32):
     gain = s[_K]
     shift = s[_K_SHIFT] - 16  # twice K, and 15 bits are in the split
     half = 1 << shift >> 1
-    i = 0
-    while i < 3:
-        x = s[_S + i] << k >> k
-        y = ((s[_FORCE + i] << k >> k) >> 1) - x
-        if i < 2:
-            s[_OFF + i] = y
-        h = (y + 32768) >> 16
-        y -= h << 16
-        s[_S + i] = x + (((h * gain << 1) + (y * gain >> 15) + half) >> shift)
-        i += 1
+    x = s[_S] << k >> k
+    y = ((s[_FORCE] << k >> k) >> 1) - x
+    s[_OFF] = y
+    h = (y + 32768) >> 16
+    x += ((h * gain << 1) + ((y - (h << 16)) * gain >> 15) + half) >> shift
+    s[_S] = x
+    y = s[_S + 1] << k >> k
+    h = ((s[_FORCE + 1] << k >> k) >> 1) - y
+    s[_OFF + 1] = h
+    t = (h + 32768) >> 16
+    y += ((t * gain << 1) + ((h - (t << 16)) * gain >> 15) + half) >> shift
+    s[_S + 1] = y
+    z = s[_S + 2] << k >> k
+    h = ((s[_FORCE + 2] << k >> k) >> 1) - z
+    t = (h + 32768) >> 16
+    z += ((t * gain << 1) + ((h - (t << 16)) * gain >> 15) + half) >> shift
+    s[_S + 2] = z
     # (x, y): S, no part of it more than 1 g
     most = s[_G1] << 14
-    x = s[_S] << k >> k
     if x > most:
         x = most
     elif x < 0 - most:
         x = 0 - most
-    y = s[_S + 1] << k >> k
     if y > most:
         y = most
     elif y < 0 - most:
@@ -187,7 +187,7 @@ def level(s: ptr32):
     x <<= n
     y <<= n
     decided = s[_DECIDED] | _OVER
-    if (s[_S + 2] << k >> k) < 0:
+    if z < 0:
         # upside down: (x, y) *= 1.4 / |(x, y)| where that is shorter than 1 g
         most = s[_G1] << n
         i = (x + 8192) >> 14
@@ -221,30 +221,15 @@ def level(s: ptr32):
 
 # ------------------------------------------------------------------------------------------ once a block
 @micropython.viper
-def detect_rest(state, counts):
+def detect_rest(s: ptr32):
     """STILL: for how long gyro and accelerometer have stayed near their low-passes, the gyro near a well-known bias.
 
     A block's mean goes into the gyro's low-pass; what is judged is the sample. At rest a tilt error that cannot be
     restarts the ramps.
     """
-    s = ptr32(state)
-    c = ptr16(counts)
     k = 0
     if s[_PROBE] > 0:
         k = 32
-    fine = 12 - s[_BLOCK]
-    i = 0
-    while i < 3:
-        x = ((c[i] & 0xFFFF) ^ 0x8000) - 0x8000
-        s[_IN + i] = x << 12
-        s[_SEEN + i] = x << 12
-        y = (s[_BASE + i] << k >> k) << 4
-        x = ((c[3 + i] & 0xFFFF) ^ 0x8000) - 0x8000
-        s[_SEEN + 3 + i] = (x << 12) - y
-        s[_IN + 3 + i] = ((s[_GS + i] << k >> k) << fine) - y
-        s[_GS + i] = 0
-        i += 1
-    low_pass(state, _SEEN)
     # still: |seen - LOW2| small, |gyro| < REST_MOST, and |gyro - B| < REST_OFF where INFO > INFO_KNOWN
     still = s[_AWAY] < s[_REST_ACCEL] and s[_AWAY + 1] < s[_REST_GYRO]
     shift = s[_B_SHIFT] - 12
@@ -550,7 +535,7 @@ def steer(s: ptr32):
 
 
 @micropython.viper
-def inform(s: ptr32):
+def learn(s: ptr32):
     """The regressor up, and what the block tells about the bias: U, times information; J grows and decays."""
     k = 0
     if s[_PROBE] > 0:
@@ -622,16 +607,8 @@ def inform(s: ptr32):
         s[_INFO + n] = x
         s[_U + n] = u
         n += 1
-
-
-@micropython.viper
-def learn(s: ptr32):
-    """The bias less U / J, and from it O, what the steps subtract: minus the bias as a half angle."""
-    k = 0
-    if s[_PROBE] > 0:
-        k = 32
+    # the bias less U / INFO, and from it O, what the steps subtract: minus the bias as a half angle
     b_shift = s[_B_SHIFT]
-    still = s[_STILL] == s[_REST_AFTER]
     gain = s[_G]
     rest = s[_GR]
     n = 0

@@ -78,6 +78,8 @@ class Mahony6(Attitude):
 
     def __init__(self, rate, gyro_scale, accel_lsb_per_g, kp=0.5, ki=0.0, bias_limit_dps=20):
         Attitude.__init__(self, rate, gyro_scale, accel_lsb_per_g, _WORDS)
+        self.bias_set = [0, 0, 0]  # 1/256 counts
+        self.heading_seeded = False
         s = self.state
         s[_Q] = fixmath.ONE
         s[_LOW] = accel_lsb_per_g * accel_lsb_per_g >> 10  # (1/16 g)**2 / 4
@@ -259,7 +261,6 @@ class Mahony9(Mahony6):
     NAME = "mahony9"
     AXES = 9
 
-    heading_seeded = False
     update = Mahony6.update  # see attitude.py
 
     def seed(self, counts):

@@ -7,16 +7,16 @@ import micropython
 from micropython import const
 
 from upright import fixmath
-from upright.earth_kernels import MILLION, EarthFilter, advance, compass, fine_mantissa
+from upright.earth_kernels import MILLION, EarthFilter, compass, fine_mantissa, low_pass, to_earth
+from upright.fixmath import turn
 from upright.quaternion_kernels import (
     add_noise,
     after_tilt,
     carry_errors,
-    find_gains,
     forget,
+    measure,
     measure_rest,
     ready_for_heading,
-    shrink_covariance,
     spread_attitude,
     spread_bias,
     spread_velocity,
@@ -27,8 +27,16 @@ from upright.quaternion_kernels import (
 
 # -- words of the state: written by tools/upright_host/words.py
 _PROBE = const(0)
-_B = const(32)
-_FORCE = const(47)
+_W = const(9)
+_WR = const(12)
+_G = const(15)
+_GR = const(16)
+_O = const(17)
+_OR = const(20)
+_TURN = const(23)
+_R = const(26)
+_FORCE = const(35)
+_B = const(47)
 _NINE = const(50)
 _BLOCK = const(51)
 _BLOCK_MASK = const(52)
@@ -37,6 +45,7 @@ _DECIDED = const(54)
 _GS = const(55)
 _SINCE = const(62)
 _J = const(63)
+_IN = const(67)
 _STILL = const(88)
 _REST_AFTER = const(89)
 _REST_MOST = const(93)
@@ -44,54 +53,54 @@ _HS = const(94)
 _AS = const(97)
 _STAGE = const(100)
 _PER = const(101)
-_ML = const(120)
-_X = const(124)
-_V = const(132)
-_P = const(134)
-_UH = const(206)
-_UE = const(207)
-_UR = const(208)
-_UM = const(209)
-_OVER = const(210)
-_MEANT = const(211)
-_HG = const(213)
-_HG_SHIFT = const(214)
-_C = const(215)
-_B_SHIFT = const(216)
-_B_MOST = const(217)
-_QT = const(218)
-_QB = const(220)
-_QS = const(222)
-_QS_SHIFT = const(223)
-_BS = const(224)
-_RV = const(225)
-_RM = const(226)
-_RR = const(227)
-_RA = const(228)
-_V0 = const(229)
-_AXIS = const(230)
-_Z = const(231)
-_REST_OFF = const(234)
-_KNOWN = const(235)
-_CB = const(236)
-_CB_SHIFT = const(237)
-_WIDE_FOR = const(238)
-_WIDE_MOST = const(239)
-_LOST = const(240)
-_LOST_MOST = const(241)
-_FAR = const(249)
-_FIELD_AFTER = const(250)
-_TOL = const(251)
-_SMOOTH = const(252)
-_TAU = const(253)
-_TAU_FAR = const(254)
-_TAU_0 = const(255)
-_FAR_MOST = const(256)
-_GOOD = const(257)
-_FIRST = const(258)
-_YOUNG = const(260)
-_AFTER = const(261)
-_WORDS = const(262)
+_ML = const(117)
+_X = const(121)
+_V = const(129)
+_P = const(131)
+_UH = const(203)
+_UE = const(204)
+_UR = const(205)
+_UM = const(206)
+_OVER = const(207)
+_MEANT = const(208)
+_HG = const(210)
+_HG_SHIFT = const(211)
+_C = const(212)
+_B_SHIFT = const(213)
+_B_MOST = const(214)
+_QT = const(215)
+_QB = const(217)
+_QS = const(219)
+_QS_SHIFT = const(220)
+_BS = const(221)
+_RV = const(222)
+_RM = const(223)
+_RR = const(224)
+_RA = const(225)
+_V0 = const(226)
+_AXIS = const(227)
+_Z = const(228)
+_REST_OFF = const(231)
+_KNOWN = const(232)
+_CB = const(233)
+_CB_SHIFT = const(234)
+_WIDE_FOR = const(235)
+_WIDE_MOST = const(236)
+_LOST = const(237)
+_LOST_MOST = const(238)
+_FAR = const(246)
+_FIELD_AFTER = const(247)
+_TOL = const(248)
+_SMOOTH = const(249)
+_TAU = const(250)
+_TAU_FAR = const(251)
+_TAU_0 = const(252)
+_FAR_MOST = const(253)
+_GOOD = const(254)
+_FIRST = const(255)
+_YOUNG = const(257)
+_AFTER = const(258)
+_WORDS = const(259)
 # -- end of the words
 
 _PI28 = const(105414357 << 3)  # quaternion_kernels' pi, Q25
@@ -125,6 +134,7 @@ def work(state, n: int):
     elif n == 3:
         if s[_YOUNG]:
             s[_YOUNG] -= 1
+        low_pass(state, _IN + 3)
         measure_rest(state)
         if s[_DECIDED] & _UPSET:
             forget(state, 0, _OPEN)
@@ -144,8 +154,7 @@ def work(state, n: int):
             s[_UH] = 3 + i
             s[_UR] = s[_RR]
             s[_UM] = 0
-            find_gains(state)
-            shrink_covariance(state)
+            measure(state)
     elif n == 6:
         if s[_NINE]:
             i = int(ready_for_heading(state))
@@ -156,8 +165,7 @@ def work(state, n: int):
                 s[_UM] = _NOT_BY_MAG
                 if s[_YOUNG]:
                     s[_UM] |= _BIAS
-                find_gains(state)
-                shrink_covariance(state)
+                measure(state)
     else:
         if n == 4:
             tilt_from_accel(state)
@@ -173,8 +181,7 @@ def work(state, n: int):
             s[_UH] = 6 + i
             s[_UE] = 0 - s[_V + i]
             s[_UR] = s[_RV]
-        find_gains(state)
-        shrink_covariance(state)
+        measure(state)
         m = s[_OVER]
         if n == 4:
             s[_DECIDED] = (s[_DECIDED] | _RUNAWAY) ^ _RUNAWAY
@@ -263,14 +270,81 @@ class QuaternionKalman9(EarthFilter):
     }
 
     def __init__(self, rate, gyro_scale, accel_lsb_per_g, **parameters):
-        EarthFilter.__init__(
-            self, rate, gyro_scale, accel_lsb_per_g, _WORDS, _bias_most, _corrections, parameters
-        )
-        _set_up(self, parameters)
-        self.set_bias(0, 0, 0)
-        self.start_at((fixmath.ONE, 0, 0, 0))
+        EarthFilter.__init__(self, rate, gyro_scale, accel_lsb_per_g, _WORDS, parameters)
 
-    # -- set-up and main loop
+    # -- set-up and main loop: allocates
+    def bounds(self, p):
+        return 25 * MILLION, _FOLD_W
+
+    def set_up(self, p, given):
+        # every variance stays below 2**30
+        s, lsb = self.state, self.accel_lsb_per_g
+        blocks, counts, ratio = self.blocks, self.counts, fixmath.ratio
+        num, den = self.rate
+        scale, per = self.gyro_scale
+        shift = s[_BLOCK]
+        t = den << shift  # a block lasts t / num s
+        rad, degrees = fixmath.PI_NUM, 180 * fixmath.PI_DEN  # a degree
+
+        def squared(value, of, power, bits):
+            """(value / of)**2 (t / num)**power in units of 2**-bits."""
+            if power < 0:
+                return ratio((value * value << bits) * num**-power, of * of * t**-power)
+            return ratio((value * value << bits) * t**power, of * of * num**power)
+
+        s[_STAGE] = 8
+        s[_PER] = 2 if shift == 2 else 1
+        s[_HG], s[_HG_SHIFT] = fine_mantissa(1 << 11, lsb << shift, 14)
+        if p["bias_walk"] * 20 > p["bias_start"]:
+            raise ValueError(
+                "bias_walk is %r, expected no more than 1/20 of bias_start" % (given["bias_walk"],)
+                if "bias_walk" in given
+                else "bias_start is %r, expected at least 20 times bias_walk"
+                % (given["bias_start"],)
+            )
+        # the bias: 2**-c rad a block
+        c = 16
+        while squared(p["bias_start"] * rad, MILLION * degrees, 2, 2 * c + 2) <= _SIGMA**2:
+            c += 1
+        s[_C] = c - 15
+        s[_B_SHIFT] = c + shift - 20
+        s[_BS] = squared(p["bias_start"] * rad, MILLION * degrees, 2, 2 * c)
+        most = p["bias_start"] * 5 * rad * t << (c + 9)  # 2.5 sigma
+        s[_B_MOST] = min((1 << 30) - 1, ratio(most, MILLION * degrees * num))
+        s[_AFTER] = blocks(p["bias_after"])
+        # noise of a block
+        s[_QT] = squared(p["gyro_noise"] * rad, MILLION * degrees, 1, 46)
+        s[_QB] = squared(p["bias_walk"] * rad, MILLION * degrees, 3, 2 * c + 12)
+        value = p["scale_error"] * rad * per
+        s[_QS], s[_QS_SHIFT] = fine_mantissa(
+            (value * value << 34) * t, (MILLION * degrees * scale) ** 2 * num, 15
+        )
+        # variances of measurements, / 16
+        s[_RA] = squared(p["accel_noise"], MILLION, 0, 26)
+        s[_RV] = squared(p["velocity_noise"] * 100000, MILLION * 980665, -3, 16)
+        s[_RM] = squared(p["mag_noise"], MILLION, -1, 26)
+        r = ratio(squared(p["rest_noise"] * rad, MILLION * degrees, 1, 2 * c), 48)
+        s[_RR] = min(max(r, 256), 1 << 29)
+        s[_V0] = squared(5, 100, -2, 20)
+        # rest
+        s[_REST_MOST] = counts(p["bias_start"] * 5 // 2, 4096)
+        s[_REST_OFF] = ratio(rad * t << (c + 9), degrees * num)
+        s[_KNOWN] = squared(rad, 10 * degrees, 2, 2 * c)
+        s[_CB], s[_CB_SHIFT] = fine_mantissa(
+            (rad * per * t) << (c + 10), (degrees * scale * num) << 12, 15
+        )
+        s[_WIDE_MOST] = max(1, blocks(400000))
+        s[_LOST_MOST] = blocks(MILLION)
+        # field
+        s[_FIELD_AFTER] = max(1, blocks(300000))
+        s[_TOL] = ratio(p["field_tolerance"] ** 2 << 14, MILLION**2)
+        s[_SMOOTH] = blocks(50000, 10)
+        s[_TAU] = blocks(20 * MILLION, 10)
+        s[_TAU_FAR] = blocks(100 * MILLION, 10)
+        s[_TAU_0] = blocks(200000, 10)
+        s[_FAR_MOST] = blocks(5 * MILLION)
+        s[_FIRST] = blocks(2 * MILLION)
+
     def start_at(self, q, known=0):
         EarthFilter.start_at(self, q)
         s = self.state
@@ -334,19 +408,63 @@ class QuaternionKalman9(EarthFilter):
         of the steps' will do. Bits 2 and 3 (full scale) change nothing: to leave such samples out would be worse.
         """
         state = self.state
-        advance(state, counts)
         s = ptr32(state)
         c = ptr16(counts)
-        if c[10] & 1:
-            k = 0
-            if s[_PROBE] > 0:
-                k = 32
-            i = 0
-            while i < 3:
-                n = ((c[i] & 0xFFFF) ^ 0x8000) - 0x8000
-                s[_AS + i] = (s[_AS + i] << k >> k) + n
-                s[_HS + i] = (s[_HS + i] << k >> k) + ((s[_FORCE + i] << k >> k) + 32 >> 6)
-                i += 1
+        k = 0
+        if s[_PROBE] > 0:
+            k = 32
+        # W = (gyro - bias) dt / 2
+        gain = s[_G]
+        fine = s[_GR]
+        n = ((c[3] & 0xFFFF) ^ 0x8000) - 0x8000
+        x = (s[_O] << k >> k) + n * gain
+        u = (s[_OR] << k >> k) + n * fine + s[_WR]
+        m = ((c[4] & 0xFFFF) ^ 0x8000) - 0x8000
+        y = (s[_O + 1] << k >> k) + m * gain
+        v = (s[_OR + 1] << k >> k) + m * fine + s[_WR + 1]
+        o = ((c[5] & 0xFFFF) ^ 0x8000) - 0x8000
+        z = (s[_O + 2] << k >> k) + o * gain
+        w = (s[_OR + 2] << k >> k) + o * fine + s[_WR + 2]
+        fresh = c[10] & 1
+        if fresh:
+            s[_GS] = (s[_GS] << k >> k) + n
+            s[_GS + 1] = (s[_GS + 1] << k >> k) + m
+            s[_GS + 2] = (s[_GS + 2] << k >> k) + o
+            if s[_PHASE] == 1:
+                # the first step of a block: + R' TURN, the last correction, from the earth into the body
+                i = 0
+                r = _R
+                while i < 3:
+                    n = s[_TURN + i] << k >> k
+                    s[_TURN + i] = 0
+                    m = (n + 16384) >> 15
+                    n -= m << 15
+                    o = s[r] << k >> k
+                    x += o * m + (o * n + 16384 >> 15)
+                    o = s[r + 1] << k >> k
+                    y += o * m + (o * n + 16384 >> 15)
+                    o = s[r + 2] << k >> k
+                    z += o * m + (o * n + 16384 >> 15)
+                    r += 3
+                    i += 1
+        s[_WR] = u & 32767
+        s[_W] = x + (u >> 15)
+        s[_WR + 1] = v & 32767
+        s[_W + 1] = y + (v >> 15)
+        s[_WR + 2] = w & 32767
+        s[_W + 2] = z + (w >> 15)
+        turn(state)
+        if fresh:
+            to_earth(state, counts)
+            n = ((c[0] & 0xFFFF) ^ 0x8000) - 0x8000
+            s[_AS] = (s[_AS] << k >> k) + n
+            n = ((c[1] & 0xFFFF) ^ 0x8000) - 0x8000
+            s[_AS + 1] = (s[_AS + 1] << k >> k) + n
+            n = ((c[2] & 0xFFFF) ^ 0x8000) - 0x8000
+            s[_AS + 2] = (s[_AS + 2] << k >> k) + n
+            s[_HS] = (s[_HS] << k >> k) + ((s[_FORCE] << k >> k) + 32 >> 6)
+            s[_HS + 1] = (s[_HS + 1] << k >> k) + ((s[_FORCE + 1] << k >> k) + 32 >> 6)
+            s[_HS + 2] = (s[_HS + 2] << k >> k) + ((s[_FORCE + 2] << k >> k) + 32 >> 6)
             n = s[_PHASE]
             s[_PHASE] = (n + 1) & s[_BLOCK_MASK]
             if n == 0:
@@ -370,86 +488,6 @@ class QuaternionKalman6(QuaternionKalman9):
 
 
 # ----------------------------------------------------------------------------- set-up: allocates
-def _bias_most(p):
-    return 25 * MILLION
-
-
-def _corrections(p):
-    return _FOLD_W
-
-
 def _mdeg(variance):
     """The root of a variance in rad**2, Q30, in millidegrees."""
     return fixmath.ratio(fixmath.isqrt(variance << 20) * 57296, 1 << 25)
-
-
-def _set_up(filter, given):
-    """Turn rate, scales and parameters into the state's words, in integers throughout; every variance below 2**30.
-
-    given: the parameters as they were given.
-    """
-    s, p, lsb = filter.state, filter.parameters, filter.accel_lsb_per_g
-    blocks, counts, ratio = filter.blocks, filter.counts, fixmath.ratio
-    num, den = filter.rate
-    scale, per = filter.gyro_scale
-    shift = s[_BLOCK]
-    t = den << shift  # a block lasts t / num s
-    rad, degrees = fixmath.PI_NUM, 180 * fixmath.PI_DEN  # a degree
-
-    def squared(value, of, power, bits):
-        """(value / of)**2 (t / num)**power in units of 2**-bits."""
-        if power < 0:
-            return ratio((value * value << bits) * num**-power, of * of * t**-power)
-        return ratio((value * value << bits) * t**power, of * of * num**power)
-
-    s[_STAGE] = 8
-    s[_PER] = 2 if shift == 2 else 1
-    s[_HG], s[_HG_SHIFT] = fine_mantissa(1 << 11, lsb << shift, 14)
-    if p["bias_walk"] * 20 > p["bias_start"]:
-        raise ValueError(
-            "bias_walk is %r, expected no more than 1/20 of bias_start" % (given["bias_walk"],)
-            if "bias_walk" in given
-            else "bias_start is %r, expected at least 20 times bias_walk" % (given["bias_start"],)
-        )
-    # the bias: 2**-c rad a block
-    c = 16
-    while squared(p["bias_start"] * rad, MILLION * degrees, 2, 2 * c + 2) <= _SIGMA**2:
-        c += 1
-    s[_C] = c - 15
-    s[_B_SHIFT] = c + shift - 20
-    s[_BS] = squared(p["bias_start"] * rad, MILLION * degrees, 2, 2 * c)
-    most = p["bias_start"] * 5 * rad * t << (c + 9)  # 2.5 sigma
-    s[_B_MOST] = min((1 << 30) - 1, ratio(most, MILLION * degrees * num))
-    s[_AFTER] = blocks(p["bias_after"])
-    # noise of a block
-    s[_QT] = squared(p["gyro_noise"] * rad, MILLION * degrees, 1, 46)
-    s[_QB] = squared(p["bias_walk"] * rad, MILLION * degrees, 3, 2 * c + 12)
-    value = p["scale_error"] * rad * per
-    s[_QS], s[_QS_SHIFT] = fine_mantissa(
-        (value * value << 34) * t, (MILLION * degrees * scale) ** 2 * num, 15
-    )
-    # variances of measurements, / 16
-    s[_RA] = squared(p["accel_noise"], MILLION, 0, 26)
-    s[_RV] = squared(p["velocity_noise"] * 100000, MILLION * 980665, -3, 16)
-    s[_RM] = squared(p["mag_noise"], MILLION, -1, 26)
-    r = ratio(squared(p["rest_noise"] * rad, MILLION * degrees, 1, 2 * c), 48)
-    s[_RR] = min(max(r, 256), 1 << 29)
-    s[_V0] = squared(5, 100, -2, 20)
-    # rest
-    s[_REST_MOST] = counts(p["bias_start"] * 5 // 2, 4096)
-    s[_REST_OFF] = ratio(rad * t << (c + 9), degrees * num)
-    s[_KNOWN] = squared(rad, 10 * degrees, 2, 2 * c)
-    s[_CB], s[_CB_SHIFT] = fine_mantissa(
-        (rad * per * t) << (c + 10), (degrees * scale * num) << 12, 15
-    )
-    s[_WIDE_MOST] = max(1, blocks(400000))
-    s[_LOST_MOST] = blocks(MILLION)
-    # field
-    s[_FIELD_AFTER] = max(1, blocks(300000))
-    s[_TOL] = ratio(p["field_tolerance"] ** 2 << 14, MILLION**2)
-    s[_SMOOTH] = blocks(50000, 10)
-    s[_TAU] = blocks(20 * MILLION, 10)
-    s[_TAU_FAR] = blocks(100 * MILLION, 10)
-    s[_TAU_0] = blocks(200000, 10)
-    s[_FAR_MOST] = blocks(5 * MILLION)
-    s[_FIRST] = blocks(2 * MILLION)

@@ -15,18 +15,16 @@ from array import array
 import micropython
 from micropython import const
 
-from upright.earth_kernels import low_pass
-
 # -- words of the state: written by tools/upright_host/words.py
 _PROBE = const(0)  # always -1, see fixmath.py
 _O = const(17)  # 3, Q31: minus the bias as a half angle per step
 _OR = const(20)  # 3, Q46: its last bits, -32767..32767
-_BASE = const(23)  # 3, Q8: gyro bias that was set, counts
-_O_BASE = const(26)  # 3, Q31: O of BASE alone
-_OR_BASE = const(29)  # 3, Q46: its last bits
-_B = const(32)  # 3: learnt bias on top of BASE, in the filter's own unit
-_TURN = const(35)  # 3, Q31: correction that the next step takes up, earth frame, half angle
-_R = const(38)  # 9, Q15: rotation matrix; its rows are north, west, up in the body
+_TURN = const(23)  # 3, Q31: correction that the next step takes up, earth frame, half angle
+_R = const(26)  # 9, Q15: rotation matrix; its rows are north, west, up in the body
+_BASE = const(38)  # 3, Q8: gyro bias that was set, counts
+_O_BASE = const(41)  # 3, Q31: O of BASE alone
+_OR_BASE = const(44)  # 3, Q46: its last bits
+_B = const(47)  # 3: learnt bias on top of BASE, in the filter's own unit
 _BLOCK = const(51)  # log2 of the steps of a block
 _DECIDED = const(54)  # yes/no decisions, for the tests' float twin
 _GS = const(55)  # 3: gyro counts summed over the block
@@ -47,62 +45,63 @@ _HS = const(94)  # 3, Q9: specific force in the earth frame, summed over the blo
 _AS = const(97)  # 3: accelerometer counts, summed
 _T = const(102)  # 9, Q15: R at the end of the block
 _H = const(111)  # 3, Q20: the block's mean specific force in the earth frame, g
-_AM = const(114)  # 3: AS of the block; AM and GM stand together
-_GM = const(117)  # 3: GS of the block
-_ML = const(120)  # 3, Q9: MS of the block
-_MLN = const(123)  # MN of the block
-_X = const(124)  # 8: estimated errors, not applied yet; 10 bits finer than P's units
-_V = const(132)  # 2, Q20: horizontal velocity, g * block
-_P = const(134)  # 36: upper triangle of the covariance, row by row
-_N = const(170)  # 9: attitude-bias part of P, mean of before and after the block
-_ROW = const(179)  # 8: row of P of what is measured
-_M = const(187)  # 8: gain of error i = M / 2**(E + 15), M of 28 to 31 bits
-_E = const(195)  # 8
-_FOLDED = const(203)  # 3, Q25: correction that the new block starts with, rad
-_UH = const(206)  # which error is measured ...
-_UE = const(207)  # ... its measured value, in X's units ...
-_UR = const(208)  # ... its variance / 16, in P's units ...
-_UM = const(209)  # ... bits of the errors that it must not correct
-_OVER = const(210)  # 1: it was beyond 2.5 sigma
-_MEANT = const(211)  # 2: tilt from the accelerometer as it is, X's units
-_HG = const(213)  # HS to H: HG / 2**HG_SHIFT
-_HG_SHIFT = const(214)
-_C = const(215)  # C - 15; the bias is in units of 2**-C rad a block, B 10 bits finer
-_B_SHIFT = const(216)  # B to half angle per step, Q31
-_B_MOST = const(217)  # bound of B
-_QT = const(218)  # variance that a block adds to the attitude, 2**-16 of P's unit ...
-_QTR = const(219)  # ... and what is carried of it
-_QB = const(220)  # the same for the bias, 2**-12
-_QBR = const(221)
-_QS = const(222)  # variance per (4 counts)**2 of the gyro: QS / 2**QS_SHIFT
-_QS_SHIFT = const(223)
-_BS = const(224)  # first variance of the bias
-_RM = const(226)  # ... heading from one block ...
-_Z = const(231)  # 3: low-passed gyro in B's units
-_REST_OFF = const(234)  # most that a known bias may be off, B's units
-_KNOWN = const(235)  # variance of a known bias
-_CB = const(236)  # counts (Q12) to B's units: CB / 2**CB_SHIFT
-_CB_SHIFT = const(237)
-_WIDE_FOR = const(238)  # blocks for which the accelerometer has been believed as it is; then 2, 1, 0
-_WIDE_MOST = const(239)
-_LOST = const(240)  # blocks with the velocity beyond 2.5 sigma
-_LOST_MOST = const(241)
-_FIELD = const(242)  # 2, Q13: smoothed field, counts; NOW, FIELD and REF as (horizontal, vertical)
-_REF = const(244)  # 2, Q13: reference
-_HAVE = const(246)  # 1: there is one
-_NEAR = const(247)  # blocks near the reference, no more than FIELD_AFTER
-_AGE = const(248)  # blocks with a field, no more than 16384
-_FAR = const(249)  # blocks of large heading error
-_FIELD_AFTER = const(250)  # blocks
-_TOL = const(251)  # Q14: tolerance squared
-_SMOOTH = const(252)  # Q10: blocks of 0.05 s
-_TAU = const(253)  # Q10: blocks of the reference's time constant
-_TAU_FAR = const(254)  # Q10: the same while the field is another
-_TAU_0 = const(255)  # Q10: blocks of 0.2 s
-_FAR_MOST = const(256)  # blocks
-_GOOD = const(257)  # 1: the field is that of the reference; 2: there is no reference yet
-_FIRST = const(258)  # blocks after which there is one
-_NOISE = const(259)  # variance / 16 of the heading
+_GM = const(114)  # 3: GS of the block
+_ML = const(117)  # 3, Q9: MS of the block
+_MLN = const(120)  # MN of the block
+_X = const(121)  # 8: estimated errors, not applied yet; 10 bits finer than P's units
+_V = const(129)  # 2, Q20: horizontal velocity, g * block
+_P = const(131)  # 36: upper triangle of the covariance, row by row
+_N = const(167)  # 9: attitude-bias part of P, mean of before and after the block
+_ROW = const(176)  # 8: row of P of what is measured
+_M = const(184)  # 8: gain of error i = M / 2**(E + 15), M of 28 to 31 bits
+_E = const(192)  # 8
+_FOLDED = const(200)  # 3, Q25: correction that the new block starts with, rad
+_UH = const(203)  # which error is measured ...
+_UE = const(204)  # ... its measured value, in X's units ...
+_UR = const(205)  # ... its variance / 16, in P's units ...
+_UM = const(206)  # ... bits of the errors that it must not correct
+_OVER = const(207)  # 1: it was beyond 2.5 sigma
+_MEANT = const(208)  # 2: tilt from the accelerometer as it is, X's units
+_HG = const(210)  # HS to H: HG / 2**HG_SHIFT
+_HG_SHIFT = const(211)
+_C = const(212)  # C - 15; the bias is in units of 2**-C rad a block, B 10 bits finer
+_B_SHIFT = const(213)  # B to half angle per step, Q31
+_B_MOST = const(214)  # bound of B
+_QT = const(215)  # variance that a block adds to the attitude, 2**-16 of P's unit ...
+_QTR = const(216)  # ... and what is carried of it
+_QB = const(217)  # the same for the bias, 2**-12
+_QBR = const(218)
+_QS = const(219)  # variance per (4 counts)**2 of the gyro: QS / 2**QS_SHIFT
+_QS_SHIFT = const(220)
+_BS = const(221)  # first variance of the bias
+_RM = const(223)  # ... heading from one block ...
+_Z = const(228)  # 3: low-passed gyro in B's units
+_REST_OFF = const(231)  # most that a known bias may be off, B's units
+_KNOWN = const(232)  # variance of a known bias
+_CB = const(233)  # counts (Q12) to B's units: CB / 2**CB_SHIFT
+_CB_SHIFT = const(234)
+_WIDE_FOR = const(
+    235
+)  # blocks for which the accelerometer has been believed as it is; then 2, 1, 0
+_WIDE_MOST = const(236)
+_LOST = const(237)  # blocks with the velocity beyond 2.5 sigma
+_LOST_MOST = const(238)
+_FIELD = const(239)  # 2, Q13: smoothed field, counts; NOW, FIELD and REF as (horizontal, vertical)
+_REF = const(241)  # 2, Q13: reference
+_HAVE = const(243)  # 1: there is one
+_NEAR = const(244)  # blocks near the reference, no more than FIELD_AFTER
+_AGE = const(245)  # blocks with a field, no more than 16384
+_FAR = const(246)  # blocks of large heading error
+_FIELD_AFTER = const(247)  # blocks
+_TOL = const(248)  # Q14: tolerance squared
+_SMOOTH = const(249)  # Q10: blocks of 0.05 s
+_TAU = const(250)  # Q10: blocks of the reference's time constant
+_TAU_FAR = const(251)  # Q10: the same while the field is another
+_TAU_0 = const(252)  # Q10: blocks of 0.2 s
+_FAR_MOST = const(253)  # blocks
+_GOOD = const(254)  # 1: the field is that of the reference; 2: there is no reference yet
+_FIRST = const(255)  # blocks after which there is one
+_NOISE = const(256)  # variance / 16 of the heading
 # -- end of the words
 
 _STILL_BIT = const(1)
@@ -150,6 +149,7 @@ def take_sums(s: ptr32):
         i += 1
     gain = s[_HG]
     shift = s[_HG_SHIFT]
+    fine = 12 - s[_BLOCK]
     i = 0
     while i < 3:
         x = s[_HS + i] << k >> k
@@ -161,9 +161,11 @@ def take_sums(s: ptr32):
             x = m * gain + (x * gain >> 15) + (1 << shift - 15 >> 1) >> shift - 15
         s[_H + i] = x
         s[_HS + i] = 0
-        s[_AM + i] = s[_AS + i]
+        s[_IN + i] = (s[_AS + i] << k >> k) << fine
         s[_AS + i] = 0
-        s[_GM + i] = s[_GS + i]
+        x = s[_GS + i] << k >> k
+        s[_GM + i] = x
+        s[_IN + 3 + i] = (x << fine) - ((s[_BASE + i] << k >> k) << 4)
         s[_GS + i] = 0
         s[_ML + i] = s[_MS + i]
         s[_MS + i] = 0
@@ -407,10 +409,10 @@ def forget(s: ptr32, i: int, variance: int):
 
 # ------------------------------------------------------------------------------------------ a measurement
 @micropython.viper
-def find_gains(s: ptr32):
-    """Error UH is UE, with variance 16 UR: gains of all errors, and what they make of X.
+def measure(s: ptr32):
+    """Error h = UH is UE, with variance r = 16 UR, and corrects all errors but those of UM.
 
-    The innovation is bounded by 5 sigma. Gain of i: P_ih / (P_hh + r), as a mantissa and a shift of its own.
+    The innovation is bounded by 5 sigma.
     """
     k = 0
     if s[_PROBE] > 0:
@@ -481,15 +483,7 @@ def find_gains(s: ptr32):
                 m = c * h + (m >> 15) + (1 << n >> 1) >> n
             s[_X + i] = (s[_X + i] << k >> k) + m
         i += 1
-
-
-@micropython.viper
-def shrink_covariance(s: ptr32):
-    """P_ij -= gain_i P_jh, but for pairs of which neither must be corrected (Schmidt's form)."""
-    k = 0
-    if s[_PROBE] > 0:
-        k = 32
-    mask = s[_UM]
+    # P_ij -= K_i P_jh, but for pairs of which neither must be corrected (Schmidt's form)
     p = _P
     i = 0
     while i < 8:
@@ -526,23 +520,15 @@ def shrink_covariance(s: ptr32):
 
 # ------------------------------------------------------------------------------------------ what is measured
 @micropython.viper
-def measure_rest(state):
+def measure_rest(s: ptr32):
     """STILL: for how long gyro and accelerometer have stayed near their low-passes, the gyro near a well-known bias.
 
     Z: the low-passed gyro, which measures the bias then. At rest a tilt error that cannot be is UPSET.
     """
-    s = ptr32(state)
     k = 0
     if s[_PROBE] > 0:
         k = 32
     at = ptr8(_AT)
-    fine = 12 - s[_BLOCK]
-    i = 0
-    while i < 3:
-        s[_IN + i] = (s[_AM + i] << k >> k) << fine
-        s[_IN + 3 + i] = ((s[_GM + i] << k >> k) << fine) - ((s[_BASE + i] << k >> k) << 4)
-        i += 1
-    low_pass(state, _IN)
     # still: |IN - LOW2| small, |gyro| <= REST_MOST, and |Z - B| <= REST_OFF where the variance of B is below KNOWN
     still = s[_AWAY] < s[_REST_ACCEL] and s[_AWAY + 1] < s[_REST_GYRO]
     i = 0

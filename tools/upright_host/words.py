@@ -88,13 +88,13 @@ G            1  Q31  half angle per step of one gyro count
 GR           1  Q46  its last bits, 0..32767
 O            3  Q31  minus the bias as a half angle per step
 OR           3  Q46  its last bits, -32767..32767
+TURN         3  Q31  correction that the next step takes up, earth frame, half angle
+R            9  Q15  rotation matrix; its rows are north, west, up in the body
+FORCE        3  Q15  specific force of this sample in the earth frame, counts
 BASE         3  Q8   gyro bias that was set, counts
 O_BASE       3  Q31  O of BASE alone
 OR_BASE      3  Q46  its last bits
 B            3  -    learnt bias on top of BASE, in the filter's own unit
-TURN         3  Q31  correction that the next step takes up, earth frame, half angle
-R            9  Q15  rotation matrix; its rows are north, west, up in the body
-FORCE        3  Q15  specific force of this sample in the earth frame, counts
 NINE         1  -    1: use the magnetometer
 BLOCK        1  -    log2 of the steps of a block
 BLOCK_MASK   1  -    steps of a block less 1
@@ -121,7 +121,7 @@ REST_MOST    1  Q12  most that is taken for a bias, counts
 """
 
 INERTIAL = """
-SEEN         6  Q12  as IN, but the gyro of this one sample
+SEEN         3  Q12  the gyro of one sample, less BASE
 S            3  Q14  low-passed specific force in the earth frame, counts
 OFF          2  Q14  its last sample less the low-pass, horizontal, counts
 K            1  -    tilt gain times dt = K / 2**K_SHIFT, K < 2**15
@@ -204,7 +204,6 @@ STAGE        1  -    the next piece of the block's work, 0..8
 PER          1  -    pieces in a step
 T            9  Q15  R at the end of the block
 H            3  Q20  the block's mean specific force in the earth frame, g
-AM           3  -    AS of the block; AM and GM stand together
 GM           3  -    GS of the block
 ML           3  Q9   MS of the block
 MLN          1  -    MN of the block
