@@ -16,6 +16,7 @@ for folder in (
 ):
     sys.path.insert(0, str(ROOT / folder))
 
+import histories  # noqa: E402
 import micropython  # noqa: E402, F401  (the shim: it prepares `time` before anything of lib/ is imported)
 import pytest  # noqa: E402
 from upright_host import oled, rp2040, runtimes, simulate, trials  # noqa: E402
@@ -197,6 +198,16 @@ def portable():
         done = runtimes.run(name, PORTABLE / script, args, timeout=timeout)
         assert done.returncode == 0, f"{script} on {name}:\n{done.stdout}\n{done.stderr}"
         return done.stdout
+
+    return run
+
+
+@pytest.fixture
+def filter_history(portable, tmp_path):
+    """filter_history(runtime, rendered, name, **options) -> histories.History; options: portable/filter_history.py."""
+
+    def run(runtime, rendered, name, **options):
+        return histories.run(portable, tmp_path, runtime, rendered, name, **options)
 
     return run
 

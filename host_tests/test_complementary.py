@@ -1,7 +1,6 @@
 """Euler6: as accurate as its float twin, the same bits on every runtime, right at every gate, and lost at the pole only
 as far as it says."""
 
-import json
 import math
 import random
 from array import array
@@ -11,6 +10,7 @@ import motions
 import numpy as np
 import overflow
 import pytest
+from histories import ONE, SCALE, angles_between, bias_at_rest, rows_of
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from reference.complementary_float import EulerFloat
@@ -18,12 +18,11 @@ from reference.mahony_float import angle_between
 from upright import complementary, euler_kernels
 from upright.complementary import Euler6
 from upright.mahony import Mahony6
-from upright_host import scoring, trials
+from upright_host import scoring, trials, words
 from upright_host.simulate import best_runtime as quickest
 
-ONE = 1 << 29
 TURN = 1 << 30
-SCALE = (82, 5)
+AT = words.places("euler")
 LIMIT_DEG = 0.01
 # Seven times in half a minute this motion comes within degrees of the pole at 10 deg a step, where a difference grows
 # by 1/cos(pitch), up to 32, each time.
@@ -36,14 +35,7 @@ def counts(ax=0, ay=0, az=4096, gx=0, gy=0, gz=0, flags=1):
 
 def degrees(filter):
     """Roll, pitch and yaw of the state."""
-    return [v * 360 / TURN for v in filter.state[complementary._A : complementary._A + 3]]
-
-
-def apart(p, q):
-    """Degrees between the quaternions of two (n, 4) arrays."""
-    p, q = p / np.linalg.norm(p, axis=1)[:, None], q / np.linalg.norm(q, axis=1)[:, None]
-    e = motions.multiply(p * [1, -1, -1, -1], q)
-    return np.degrees(2 * np.arctan2(np.linalg.norm(e[:, 1:], axis=1), np.abs(e[:, 0])))
+    return [v * 360 / TURN for v in filter.state[AT.A : AT.A + 3]]
 
 
 def turned(angle):
@@ -57,31 +49,17 @@ def run(filter, row, n):
 
 
 @pytest.fixture
-def history(portable, tmp_path):
+def history(filter_history):
     """history(runtime, rendered, bias, **gains): the filter over all rows, (n, 4) int32."""
 
     def go(runtime, rendered, bias=(), **gains):
-        world, out = tmp_path / "world.imu", tmp_path / "q"
-        rendered.write(world)
-        what = ("complementary", "Euler6", json.dumps(gains))
-        portable(runtime, "euler_history.py", world, out, *what, *bias)
-        q = np.fromfile(out, "<i4").reshape(-1, 4)
-        assert len(q) == len(rendered.counts)
-        return q
+        return filter_history(runtime, rendered, "euler6", gains=gains, bias=bias).q29
 
     return go
 
 
-def rows_of(rendered):
-    """The rows as lists, with the flags that portable/euler_history.py gives."""
-    rows = rendered.counts.astype(int)
-    full = ((rows[:, :3] == -32768) | (rows[:, :3] == 32767)).any(1)
-    rows[:, 10] |= np.where(full, 5, 1)
-    return rows.tolist()
-
-
 def filter_for(rendered, first, bias=(), **gains):
-    """As portable/euler_history.py begins."""
+    """As portable/filter_history.py begins."""
     filter = Euler6(rendered.rate, rendered.gyro_scale, rendered.accel_lsb_per_g, **gains)
     if bias:
         filter.set_bias(*bias)
@@ -100,15 +78,9 @@ def float_history(rendered, bias=(), gains=None, **options):
     return q
 
 
-def bias_of(trial):
-    """The bias of a trial at rest, as the firmware would have measured it."""
-    scale = trial.gyro_scale[0] / trial.gyro_scale[1] * 256
-    return [round(b * scale) for b in trial.header.get("gyro_bias_rest_dps", ())]
-
-
 # -- accuracy; pytest -rP shows the figures
 def compare(what, q, twin, limit=LIMIT_DEG):
-    worst = apart(q, twin).max()
+    worst = angles_between(q, twin).max()
     print(f"{what}: {worst:.6f} deg")
     assert worst < limit
 
@@ -130,14 +102,14 @@ def test_within_a_hundredth_of_a_degree_of_the_float_twin_on_a_recorded_trial(hi
     runtime = quickest()
     if runtime == "cpython":
         trial.counts = trial.counts[:5000]
-    bias = bias_of(trial)
+    bias = bias_at_rest(trial)
     compare(f"{trial.name}", history(runtime, trial, bias), float_history(trial, bias))
 
 
 def test_the_comparison_sees_a_first_order_step(history):
     rendered = motions.render("spin", seconds=5)
     first = float_history(rendered, midpoint=False)
-    assert apart(history(quickest(), rendered), first).max() > 100 * LIMIT_DEG
+    assert angles_between(history(quickest(), rendered), first).max() > 100 * LIMIT_DEG
 
 
 def test_a_fast_spin_costs_no_degrees_by_the_step_s_order(history):
@@ -173,7 +145,7 @@ def test_the_default_tau_is_better_than_a_short_one_where_the_body_moves(history
     trial.counts = trial.counts[:12000]
     errors = []
     for tau in (8, 0.5):
-        q = history(quickest(), trial, bias_of(trial), tau=tau) / ONE
+        q = history(quickest(), trial, bias_at_rest(trial), tau=tau) / ONE
         errors.append(scoring.score_trial(q, trial).inclination)
     print(f"{trial.name}: inclination {errors[0]:.2f} and {errors[1]:.2f} deg")
     assert errors[0] < max(errors[1], 0.1)
@@ -190,12 +162,12 @@ UNIT = 2 * math.pi / TURN
 @example(-(1 << 28))
 @example(1 << 29)
 def test_sines_are_right_to_5e_9(x):
-    s = array("i", [0] * euler_kernels.OWN)
+    s = array("i", [0] * AT.size)
     s[0] = -1
-    s[euler_kernels.X] = x
+    s[AT.X] = x
     euler_kernels.sines(s, 1)
-    assert abs(s[euler_kernels.S] / ONE - math.sin(x * UNIT)) < 5e-9
-    assert abs(s[euler_kernels.C] / ONE - math.cos(x * UNIT)) < 5e-9
+    assert abs(s[AT.S] / ONE - math.sin(x * UNIT)) < 5e-9
+    assert abs(s[AT.C] / ONE - math.cos(x * UNIT)) < 5e-9
 
 
 part = st.one_of(st.integers(-(1 << 28), 1 << 28), st.integers(-300, 300))
@@ -218,16 +190,16 @@ word = st.one_of(st.integers(-32768, 32767), st.integers(-20, 20))
 @example(4096, 0, 0)
 @example(32767, 1, 0)
 @example(-32768, -32768, -32768)
-def test_lean_is_what_the_accelerometer_shows_to_2e_3_of_a_degree(x, y, z):
-    s = array("i", [0] * euler_kernels.OWN)
+def test_accel_angles_is_what_the_accelerometer_shows_to_2e_3_of_a_degree(x, y, z):
+    s = array("i", [0] * AT.size)
     s[0] = -1
-    s[euler_kernels.LOW] = 4
-    assert euler_kernels.lean(s, counts(x, y, z)) == (
+    s[AT.LOW] = 4
+    assert euler_kernels.accel_angles(s, counts(x, y, z)) == (
         (x * x >> 2) + (y * y >> 2) + (z * z >> 2) >= 4
     )
-    if not s[euler_kernels.Z] and not s[euler_kernels.Z + 1]:
+    if not s[AT.Z] and not s[AT.Z + 1]:
         return
-    roll, pitch = s[euler_kernels.Z] * UNIT, s[euler_kernels.Z + 1] * UNIT
+    roll, pitch = s[AT.Z] * UNIT, s[AT.Z + 1] * UNIT
     assert abs(math.remainder(roll - math.atan2(y, z), 2 * math.pi)) < math.radians(2e-5)
     assert abs(pitch - math.atan2(-x, math.hypot(y, z))) < math.radians(2e-3)
 
@@ -247,8 +219,8 @@ def test_each_step_at_the_pole_is_the_twin_s(roll, pitch, turned, gyro):
     assume(abs(abs(pitch + turned[1] / 2) - (TURN >> 2)) > 1000)
     filter = Euler6(200, SCALE, 4096, tau=1)
     s = filter.state
-    s[complementary._A], s[complementary._A + 1] = roll, pitch
-    s[complementary._D], s[complementary._D + 1] = turned
+    s[AT.A], s[AT.A + 1] = roll, pitch
+    s[AT.D], s[AT.D + 1] = turned
     twin = EulerFloat.like(filter)
     twin.turned = tuple(v * UNIT for v in turned)
     row = counts(0, 0, 0, *gyro)
@@ -268,35 +240,8 @@ def test_a_slow_turn_of_a_tilted_body_is_not_lost_by_rounding():
     assert degrees(filter) == pytest.approx(np.degrees(twin.angles).tolist(), abs=8e-5)
 
 
-# -- the same bits, no allocation, no overflow
-def test_every_attitude_has_the_same_bits_on_every_runtime(history, micropython_runtime):
-    rates = ((200, 1), (2000, 7), (500, 1), (1000, 1), (50, 1), (8000, 1), (333, 1))
-    for name, rate in zip(motions.MOTIONS, rates, strict=True):
-        rendered = motions.render(name, rate=rate, seconds=400 * rate[1] / rate[0], seed=5)
-        rows = rows_of(rendered)
-        here = filter_for(rendered, rows[0], (300, -200, 1), tau=0.7)
-        expected = []
-        for row in rows:
-            here.update(row)
-            expected.append(list(here.state[1:5]))
-        got = history(micropython_runtime, rendered, (300, -200, 1), tau=0.7)
-        assert np.array_equal(got, expected), name
-        assert len(np.unique(got, axis=0)) > 100
-
-
-def test_nothing_is_allocated_in_10000_updates_and_conversions(portable, micropython_runtime):
-    said = portable(micropython_runtime, "euler_alloc.py")
-    assert said.split("\n")[:2] == ["locked: nothing allocated", "bytes allocated: 0"]
-
-
-@pytest.mark.parametrize("waste", ["float", "list"])
-def test_an_allocation_in_the_tick_is_caught(portable, micropython_runtime, waste):
-    locked, counted = portable(micropython_runtime, "euler_alloc.py", waste).split("\n")[:2]
-    assert locked == "locked: MemoryError"
-    assert int(counted.split(": ")[1]) >= 8000
-
-
-LIB = Path(complementary.__file__).parent
+# -- no overflow
+LIB = Path(AT._file__).parent
 
 
 def extreme(rng, most):
@@ -339,7 +284,7 @@ def test_nothing_leaves_32_bits_at_the_corners_of_the_accepted_range():
             row.append(rng.choice((0, 1, 1, 1, 5)))
             for j in range(3):
                 if i % 3 == 0:  # everything on one side
-                    row[3 + j] = -32768 if filter._bias[j] > 0 else 32767
+                    row[3 + j] = -32768 if filter.bias_set[j] > 0 else 32767
             filter.update(array("h", row))
             assert abs(math.hypot(*s[1:5]) / ONE - 1) < 1e-7
             assert min(s[c._A], s[c._A + 2]) >= -ONE and max(s[c._A], s[c._A + 2]) < ONE
@@ -348,7 +293,7 @@ def test_nothing_leaves_32_bits_at_the_corners_of_the_accepted_range():
     assert watch.functions == {
         "euler_kernels.sines",
         "euler_kernels.direction",
-        "euler_kernels.lean",
+        "euler_kernels.accel_angles",
         "euler_kernels.compose",
         "complementary.update",
         "complementary.step",
@@ -696,7 +641,3 @@ def test_the_usual_rates_and_gains_are_held(rate, tau):
 def test_an_unknown_parameter_is_a_type_error():
     with pytest.raises(TypeError):
         Euler6(200, SCALE, 4096, kp=1)
-
-
-def test_the_module_says_what_it_is():
-    assert (Euler6.NAME, Euler6.AXES, Euler6.QUATERNION) == ("euler6", 6, euler_kernels.Q)

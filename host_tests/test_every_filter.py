@@ -1,180 +1,19 @@
-"""What holds for every filter of the registry: the interface, and that the firmware runs with it."""
+"""What holds for every filter of the registry: that the firmware runs with it; test_attitude.py has the interface."""
 
 import dataclasses
 import hashlib
 import sys
-from array import array
 
 import dmp_images
 import motions
 import numpy as np
 import pytest
 from conftest import healthy
-from test_inertial import FIELD_UT, errors, scene
+from test_attitude import SOFTWARE, Scales
+from test_inertial import errors, scene
 from test_rp2040 import as_trial
 from upright import filters
 from upright_host import registry, replay, scoring, simulate
-
-SOFTWARE = [name for name in filters.FILTERS if name not in filters.HARDWARE]
-AT_REST = array("h", [0, 0, 4096, 10, -20, 30, 66, 0, -150, 0, 3])
-
-
-class Scales:
-    gyro_scale = (82, 5)
-    accel_lsb_per_g = 4096
-
-
-@pytest.fixture(params=SOFTWARE)
-def made(request):
-    return filters.make(request.param, 200, Scales, {})
-
-
-def test_it_has_the_name_it_is_made_by_and_all_that_a_filter_has(made):
-    assert filters.FILTERS[made.NAME][1] == type(made).__name__
-    assert made.AXES in (6, 9)
-    assert made.rate == (200, 1)
-    assert made.gyro_scale == (82, 5) and made.accel_lsb_per_g == 4096
-    q, angles, bias = array("i", [0] * 4), array("i", [0] * 3), array("i", [0] * 3)
-    assert made.seed(AT_REST)
-    made.set_bias(256 * 10, -256 * 20, 256 * 30)
-    for _ in range(1000):
-        made.update(AT_REST)
-    made.quaternion(q)
-    assert list(made.state[made.QUATERNION : made.QUATERNION + 4]) == list(q)
-    assert np.linalg.norm(q) / scoring.ONE == pytest.approx(1, abs=1e-4)
-    assert np.linalg.norm(np.array(made.quaternion_floats()) - np.array(q) / scoring.ONE) < 1e-4
-    made.angles(angles)
-    assert max(abs(a) for a in angles) < 100  # level, north, not turning
-    made.bias(bias)
-    assert np.abs(np.array(bias) / 256 - (10, -20, 30)).max() < 0.1
-    made.bias_mdps(bias)
-    assert np.abs(np.array(bias) / 1000 * 16.4 - (10, -20, 30)).max() < 0.1
-
-
-@pytest.mark.parametrize("b", [8192 * 256, -8192 * 256, 12345, -1, 0])
-def test_the_bias_reads_back(made, b):
-    out = array("i", [0] * 3)
-    made.set_bias(b, -b, 5)
-    made.bias(out)
-    assert list(out) == [b, -b, 5]
-    made.bias_mdps(out)
-    assert list(out)[:2] == [round(b * 1000 / 256 / 16.4), round(-b * 1000 / 256 / 16.4)]
-
-
-@pytest.mark.parametrize("b", [8192 * 256 + 1, -8192 * 256 - 1, 1.5])
-def test_a_bias_that_the_numbers_cannot_hold_is_refused(made, b):
-    with pytest.raises(ValueError, match=r"bias is .*, at most \+-2097152"):
-        made.set_bias(0, b, 0)
-
-
-def test_a_first_sample_without_gravity_is_none(made):
-    made.set_quaternion(1, 2, 3, 4)
-    short = array("h", AT_REST)
-    short[2] = 255  # 1/16 g
-    assert made.seed(short) is False
-    assert made.quaternion_floats() == (1, 0, 0, 0)
-
-
-@pytest.mark.parametrize("yaw", [0, 40, 120, -90, 179])
-def test_the_first_sample_gives_tilt_and_with_a_magnetometer_the_heading(made, yaw):
-    q = motions.quaternion_zyx(yaw, 20, -35)
-    turn = motions._matrix(q[None])[0]
-    row = array("h", AT_REST)
-    for i in range(3):
-        row[i] = round(4096 * turn[2][i])
-        row[3 + i] = 0
-        row[6 + i] = round((FIELD_UT @ turn)[i] / 0.3)
-    angles = array("i", [0] * 3)
-    for flags in (3, 1):
-        row[10] = flags
-        assert made.seed(row) is True
-        heading = yaw if flags == 3 and made.AXES == 9 else 0
-        for _ in range(2):
-            made.angles(angles)
-            off = (angles[2] / 1000 - heading + 180) % 360 - 180
-            assert abs(off) < 0.5 and abs(angles[1] - 20000) < 300 and abs(angles[0] + 35000) < 300
-            made.update(row)
-
-
-def test_a_field_that_stands_upright_gives_no_heading(made):
-    row = array("h", AT_REST)
-    row[6] = row[7] = 0
-    assert made.seed(row) is True
-    assert made.quaternion_floats() == pytest.approx((1, 0, 0, 0), abs=1e-6)
-
-
-@pytest.mark.parametrize("bad", [(0, 0, 0), (32767, 0, 0), (-32768, 5, 5), (5, 5, -32767)])
-def test_a_magnetometer_sample_that_cannot_be_turns_nothing(made, bad):
-    row = array("h", AT_REST)
-    row[3:6] = array("h", [0, 0, 0])
-    row[10] = 1
-    made.seed(row)
-    row[6:9] = array("h", bad)
-    row[10] = 3
-    for _ in range(200):
-        made.update(row)
-    assert not getattr(made, "mag_accepted", False)
-    angles = array("i", [0] * 3)
-    made.angles(angles)
-    assert abs(angles[2]) <= 1
-
-
-@pytest.mark.parametrize("name", [n for n in SOFTWARE if n.startswith(("inertial", "quaternion"))])
-def test_a_bias_that_was_set_is_subtracted_and_what_is_learnt_at_rest_comes_on_top(name):
-    made = filters.make(name, 200, Scales, {})
-    row = array("h", AT_REST)
-    row[3:6] = array("h", [0, 0, 820])
-    row[10] = 1
-    out = array("i", [0] * 3)
-    made.set_bias(0, 0, 820 * 256)  # 50 deg/s
-    for _ in range(200):
-        made.update(row)
-    made.angles(out)
-    assert abs(out[2]) < 5
-    row[5] = 853  # 2.01 deg/s more
-    for _ in range(200 * 10):
-        made.update(row)
-    made.bias_mdps(out)
-    assert out[2] == pytest.approx(853000 / 16.4, abs=50)
-    saved = array("i", [0] * 3)
-    made.bias(saved)
-    fresh = filters.make(name, 200, Scales, {})
-    fresh.set_bias(*saved)
-    for _ in range(200):
-        fresh.update(row)
-    fresh.angles(out)
-    assert abs(out[2]) < 60
-
-
-def test_it_goes_on_with_the_last_turn_when_samples_are_missing(made):
-    made.seed(AT_REST)
-    row = array("h", AT_REST)
-    row[3:6] = array("h", [0, 0, 820])  # 50 deg/s
-    row[10] = 0
-    for _ in range(100):
-        made.update(row)
-    angles = array("i", [0] * 3)
-    made.angles(angles)
-    assert angles[2] == pytest.approx(25000, abs=100)
-    assert abs(angles[0]) < 50 and abs(angles[1]) < 50
-
-
-def test_the_attitude_can_be_set(made):
-    for q in ((0.5, 0.5, -0.5, 0.5), (3, 0, 0, 4), (1, 2, 3, -4)):
-        made.set_quaternion(*q)
-        expected = np.array(q) / np.linalg.norm(q)
-        assert abs(np.array(made.quaternion_floats()) @ expected) > 1 - 1e-8
-    with pytest.raises(ValueError):
-        made.set_quaternion(0, 0, 0, 0)
-
-
-@pytest.mark.parametrize("name", SOFTWARE)
-def test_what_it_does_not_take_is_refused(name):
-    with pytest.raises(ValueError, match=name):
-        filters.make(name, 200, Scales, {"no_such_gain": 1})
-    for rate in (0, -200, 2.5, "200", (200, 0)):
-        with pytest.raises(ValueError, match="rate"):
-            filters.make(name, rate, Scales, {})
 
 
 def test_an_unknown_name_is_refused_with_those_that_there_are():

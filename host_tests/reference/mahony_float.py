@@ -7,6 +7,10 @@ magnetometer sample stands for), so that a comparison measures arithmetic alone.
 
 import math
 
+from upright_host import words
+
+AT = words.places("mahony")
+
 EXACT = 0  # the closed form instead of a number of terms
 
 
@@ -72,29 +76,28 @@ class MahonyFloat:
     @classmethod
     def like(cls, integer, **kw):
         """The twin of a mahony.Mahony6: its quantised gains, its bias, its attitude."""
-        from upright import mahony
 
         s = integer.state
         num, den = integer.rate
         rate = num / den
         per_half_angle = 2 * rate  # half angle per step -> rad/s
-        gyro = (s[mahony._G] + s[mahony._GR] / 32768) / 2**31 * per_half_angle
-        i_shift = s[mahony._I_SHIFT]
-        bias = tuple((s[mahony._B + i] + s[mahony._BR + i] / 32768) / 2**31 for i in range(3))
+        gyro = (s[AT.G] + s[AT.GR] / 32768) / 2**31 * per_half_angle
+        i_shift = s[AT.I_SHIFT]
+        bias = tuple((s[AT.B + i] + s[AT.BR + i] / 32768) / 2**31 for i in range(3))
         twin = cls(
             rate,
             gyro,
-            s[mahony._LOW],
-            s[mahony._KP] / 2 ** (s[mahony._KP_SHIFT] + 14) * rate / 2,
-            s[mahony._KI] / 2 ** (s[mahony._KI_SHIFT] + 14) * rate**2 / 2 ** (i_shift + 1),
-            s[mahony._I_MAX] / 2 ** (31 + i_shift) * per_half_angle,
+            s[AT.LOW],
+            s[AT.KP] / 2 ** (s[AT.KP_SHIFT] + 14) * rate / 2,
+            s[AT.KI] / 2 ** (s[AT.KI_SHIFT] + 14) * rate**2 / 2 ** (i_shift + 1),
+            s[AT.I_MAX] / 2 ** (31 + i_shift) * per_half_angle,
             tuple(b * per_half_angle for b in bias),
             **kw,
         )
-        twin.q = [v / 2**29 for v in s[mahony._Q : mahony._Q + 4]]
+        twin.q = [v / 2**29 for v in s[AT.Q : AT.Q + 4]]
         twin.normalise()
         for i in range(3):
-            twin.integral[i] = s[mahony._I + i] / 2 ** (31 + i_shift) * per_half_angle
+            twin.integral[i] = s[AT.I + i] / 2 ** (31 + i_shift) * per_half_angle
         return twin
 
     def normalise(self):
@@ -164,10 +167,9 @@ class Mahony9Float(MahonyFloat):
 
     @classmethod
     def like(cls, integer, **kw):
-        from upright import mahony
 
         twin = super().like(integer, **kw)
-        twin.mag_most = integer.state[mahony._MAG_MOST]
+        twin.mag_most = integer.state[AT.MAG_MOST]
         twin.mag_age = integer.mag_age
         return twin
 

@@ -80,9 +80,7 @@ _REST_OFF = const(231)  # most that a known bias may be off, B's units
 _KNOWN = const(232)  # variance of a known bias
 _CB = const(233)  # counts (Q12) to B's units: CB / 2**CB_SHIFT
 _CB_SHIFT = const(234)
-_WIDE_FOR = const(
-    235
-)  # blocks for which the accelerometer has been believed as it is; then 2, 1, 0
+_WIDE_FOR = const(235)  # blocks with the accelerometer believed as it is; then 2, 1, 0
 _WIDE_MOST = const(236)
 _LOST = const(237)  # blocks with the velocity beyond 2.5 sigma
 _LOST_MOST = const(238)

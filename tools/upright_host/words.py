@@ -7,6 +7,7 @@ change of a table: `python -m upright_host.words` writes the constants that each
 import re
 import sys
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 from upright_host import paths
 
@@ -244,7 +245,7 @@ REST_OFF     1  -    most that a known bias may be off, B's units
 KNOWN        1  -    variance of a known bias
 CB           1  -    counts (Q12) to B's units: CB / 2**CB_SHIFT
 CB_SHIFT     1  -
-WIDE_FOR     1  -    blocks for which the accelerometer has been believed as it is; then 2, 1, 0
+WIDE_FOR     1  -    blocks with the accelerometer believed as it is; then 2, 1, 0
 WIDE_MOST    1  -
 LOST         1  -    blocks with the velocity beyond 2.5 sigma
 LOST_MOST    1  -
@@ -326,6 +327,12 @@ MODULES = {
     "quaternion_kernels": ("quaternion_kalman", True),
     "quaternion_kalman": ("quaternion_kalman", False),
 }
+
+
+def places(state: str) -> SimpleNamespace:
+    """Where each word of a state stands, as attributes; `size`: how many words there are."""
+    words = STATES[state]
+    return SimpleNamespace(size=size(words), **{name: word.at for name, word in words.items()})
 
 
 def written(text: str, module: str) -> str:
