@@ -1,9 +1,9 @@
 # Runs a filter of the registry straight over the rows of an .imu file and writes for every row little-endian int32: the
 # attitude (4, Q29), the gyro's bias (3, 1/256 count), and the words of the state that are asked for; then prints the
 # rows and all words of the state. The same bytes on every runtime.
-# Arguments: WORLD.imu OUT NAME OPTIONS, a file of JSON: gains {}, bias [x, y, z] in 1/256 count, start [w, x, y, z] (default:
-# seed), mag_every: every so many of the rows whose flags are 0 has a fresh magnetometer (0: none); words [place ...];
-# only [place, value]: no row is written but where that word has that value.
+# Arguments: WORLD.imu OUT NAME OPTIONS, a file of JSON: gains {}, bias [x, y, z] in 1/256 count, start [w, x, y, z]
+# (default: seed), mag_every: every so many of the rows whose flags are 0 has a fresh magnetometer (0: none); words
+# [place ...]; only [place, value]: no row is written but where that word has that value.
 
 import json
 import sys

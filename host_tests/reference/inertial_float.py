@@ -70,7 +70,7 @@ def clamp(v, limit):
 
 
 class InertialFloat:
-    """The float twin of inertial_mahony.InertialMahony.
+    """The float twin of inertial.Inertial9, and by axes and lite of the others there.
 
     rate in Hz (float); gyro_scale LSB per deg/s and accel_lsb_per_g as floats; axes 6 or 9; lite: no field rejection
     and no heading restart; any of DEFAULTS.

@@ -59,7 +59,7 @@ BIAS = np.array([0, 0, 0, 1, 1, 1, 0, 0], bool)
 
 
 class QuaternionKalmanFloat:
-    """The float twin of quaternion_kalman.QuaternionKalman.
+    """The float twin of quaternion_kalman.QuaternionKalman9, with 6 axes QuaternionKalman6.
 
     rate in Hz (float); gyro_scale LSB per deg/s and accel_lsb_per_g as floats; axes 6 or 9; any of DEFAULTS.
     q: [w, x, y, z]; b: the gyro bias in the body, rad/s * T; P: covariance of the error (rotation vector in the earth

@@ -279,7 +279,7 @@ class MpuDmp(MpuDmpSetup):
         """Raises ValueError: the DMP's attitude cannot be set."""
         raise ValueError("the DMP keeps its own attitude: it cannot be set")
 
-    def set_bias(self, x, y, z):
+    def set_bias(self, x, y, z, known_s=0):
         """Raises ValueError unless all are 0: the image itself removes the bias, after some seconds at rest."""
         if x or y or z:
             raise ValueError("bias is %r: the DMP removes the gyro's bias itself" % ((x, y, z),))

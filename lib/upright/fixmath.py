@@ -69,6 +69,7 @@ def tilt(s: ptr32, counts: ptr16):
     x <<= shift
     y <<= shift
     z <<= shift
+    # VR = 1 / |V|
     h0 = x >> 1
     h1 = y >> 1
     h2 = z >> 1
@@ -97,6 +98,7 @@ def tilt(s: ptr32, counts: ptr16):
     q = s[_Q + 3] << k >> k
     h3 = (q + 16384) >> 15
     l3 = q - (h3 << 15)
+    # UP = (2 (q1 q3 - q0 q2), 2 (q0 q1 + q2 q3), q0**2 - q1**2 - q2**2 + q3**2)
     u = ((h1 * h3 - h0 * h2) << 1) + ((h1 * l3 + l1 * h3 - h0 * l2 - l0 * h2 + 8192) >> 14)
     v = ((h0 * h1 + h2 * h3) << 1) + ((h0 * l1 + l0 * h1 + h2 * l3 + l2 * h3 + 8192) >> 14)
     w = h0 * h0 - h1 * h1 - h2 * h2 + h3 * h3
@@ -104,7 +106,7 @@ def tilt(s: ptr32, counts: ptr16):
     s[_UP] = u
     s[_UP + 1] = v
     s[_UP + 2] = w
-    # the cross product of the unscaled vector, 14 bits of UP at a time; its length comes in last
+    # E = V x UP VR: the cross product of the unscaled vector, 14 bits of UP at a time; its length comes in last
     h0 = (u + 8192) >> 14
     h1 = (v + 8192) >> 14
     h2 = (w + 8192) >> 14

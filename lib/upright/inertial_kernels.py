@@ -125,6 +125,7 @@ def ramp(s: ptr32):
     s[_LATE] = 0
     if n > s[_N_LATE]:
         s[_LATE] = 1
+    # K dt = 1 / (RAMP N + 2) = m / 2**e, then 1 / (tau_tilt rate)
     m = s[_K_END]
     e = s[_K_END_SHIFT]
     if n < s[_N_RAMP]:
@@ -137,6 +138,7 @@ def ramp(s: ptr32):
             e -= 1
     s[_K] = m
     s[_K_SHIFT] = e
+    # KC: K dt / (1 g)
     m = m * s[_LI] >> 14
     e -= 1
     if m >= 32768:
@@ -273,6 +275,7 @@ def regress(s: ptr32):
     k = 0
     if s[_PROBE] > 0:
         k = 32
+    # x += 2 k ((north, west) - y - x); y += k x; k = K T, no more than 1/2
     gain = s[_K]
     shift = s[_K_SHIFT] - s[_BLOCK]
     if shift < 16:
@@ -288,6 +291,7 @@ def regress(s: ptr32):
         s[_X + i] = x
         s[_Y + i] = y + (((x + 1024 >> 11) * gain + (half << 1)) >> (shift + 1))
         i += 1
+    # D += 2 k (|OFF / 0.3 g|**2 - D), no part of OFF more than 3 g; OM = 1 / (1 + D)
     most = 3 * s[_G1] << 14
     norm = 13 - s[_NORM]
     total = 0
@@ -319,6 +323,7 @@ def smooth_field(s: ptr32, counts: ptr16):
         k = 32
     j = s[_J]
     have = s[_HAVE]
+    # F += k (NOW - F), k = j T / (0.05 s + j T)
     gain = (j << 24) // ((j << 10) + s[_SMOOTH])  # Q14
     i = 0
     while i < 2:
@@ -334,6 +339,7 @@ def smooth_field(s: ptr32, counts: ptr16):
     bits = 0
     if have == 0:
         s[_HAVE] = 1
+    # near: |F - r| < field_tolerance |r|; r is the reference, then the candidate
     i = 0
     if have < 2:
         i = 2  # no reference yet
@@ -356,6 +362,7 @@ def smooth_field(s: ptr32, counts: ptr16):
         if n * n + m * m < (x * x + y * y >> 15) * s[_TOL]:
             bits |= _NEAR_REFERENCE << (i >> 1)
         i += 2
+    # turning: |gyro - bias| >= field_dps
     have = s[_B_SHIFT] - 2
     m = 0
     i = 0
@@ -370,6 +377,7 @@ def smooth_field(s: ptr32, counts: ptr16):
         i += 1
     if m >= s[_TURNING_MIN]:
         bits |= _TURNING
+    # agrees: |e| < field_agree
     x = s[_HEADING] << k >> k
     if x < s[_AGREE] and x > 0 - s[_AGREE]:
         bits |= _AGREES
@@ -389,9 +397,11 @@ def judge_field(s: ptr32):
     j = s[_J]
     bits = s[_DECIDED]
     have = s[_HAVE]
+    # r += k (F - r), k = j T / (field_tau + j T), no more than 1/16
     gain = (j << 26) // ((j << 10) + s[_REF] >> 4)  # Q20
     if gain > 65535:
         gain = 65535
+    # good: near the reference for field_after
     good = 0
     near = 0
     if have > 1 and bits & _NEAR_REFERENCE:
@@ -417,6 +427,7 @@ def judge_field(s: ptr32):
             y += n * gain + ((x - (n << 15)) * gain >> 15) + 16 >> 5
         s[_FR + i] = y
         i += 1
+    # a candidate of field_first, later of field_new, becomes the reference
     i = s[_FIELD_FIRST]
     if have > 1:
         i = s[_FIELD_NEW]
@@ -431,6 +442,7 @@ def judge_field(s: ptr32):
             good = 1
     s[_CAND] = count
     s[_NEAR] = near
+    # weight: 1 when good or without a reference; 0, but 1/2 when rejected for longer than reject_for
     n = s[_REJECTED]
     i = 2
     if good:
@@ -454,6 +466,7 @@ def steer(s: ptr32):
     k = 0
     if s[_PROBE] > 0:
         k = 32
+    # u = sum of up_i**2 / INFO_i
     u = 0  # uncertainty of the vertical bias, Q28
     i = 0
     while i < 3:
@@ -467,6 +480,7 @@ def steer(s: ptr32):
     s[_PUSH] = 0
     s[_ZK] = 0
     if j == 0 or w == 0:
+        # DOUBT += u bias_limit T
         doubt += (u >> 14) * s[_DOUBT_RATE] >> 6
         if doubt > _PI28:
             doubt = _PI28
@@ -481,6 +495,7 @@ def steer(s: ptr32):
     if n > 65535:
         n = 65535
     if s[_LITE] == 0:
+        # |e| > restart_rad in a good field for restart_after: the ramp starts anew
         x = s[_DECIDED] | _FAR
         i = s[_LOST]
         if a <= s[_FAR_MIN]:
@@ -497,6 +512,7 @@ def steer(s: ptr32):
         s[_LOST] = i
         s[_DECIDED] = x
     s[_HN] = n
+    # k = max(1 / (ramp_heading HN + 2 j), T / tau_heading, u T / tau_doubt)
     x = 0x3FFFFFFF // (s[_HRAMP] * n + (j << 9))  # Q22
     i = (u >> 16) * s[_HK_DOUBT] >> 12
     if i < s[_HK]:
@@ -504,6 +520,7 @@ def steer(s: ptr32):
     if x <= i:
         x = i
         n = 65535
+    # after the ramp |e| <= 0.16 rad + u
     if n >= s[_LIMIT_AFTER]:
         u += _LIMIT
         if e > u:
@@ -514,6 +531,7 @@ def steer(s: ptr32):
         x >>= 1
     n = e >> 14
     e -= n << 14
+    # ZK = k j, no more than 1/2; PUSH = k e
     i = x * j
     if i > 0x200000:  # no more than half of it
         x = 0x200000 // j
@@ -525,21 +543,24 @@ def steer(s: ptr32):
         x >>= 6
         e = n * x + (e * x >> 14) + 2 >> 2
     s[_PUSH] = e
+    # TURN2 = j PUSH / 2, no more than 1/4 rad
     e *= j
     if e > 0x8000000:
         e = 0x8000000
     elif e < 0 - 0x8000000:
         e = 0 - 0x8000000
     s[_TURN + 2] = e << 2
+    # DOUBT += k j (|e| - DOUBT)
     s[_DOUBT] = doubt + (((a - doubt) >> 14) * (i >> 7) >> 1)
 
 
 @micropython.viper
 def learn(s: ptr32):
-    """The regressor up, and what the block tells about the bias: U, times information; J grows and decays."""
+    """B: what the block tells about the bias is taken up; INFO: how much is known of it."""
     k = 0
     if s[_PROBE] > 0:
         k = 32
+    # z += ZK (up - z)
     i = s[_ZK]
     shift = 12
     if i > 32767:
@@ -551,6 +572,7 @@ def learn(s: ptr32):
         z = s[_Z + n] << k >> k
         s[_Z + n] = z + (((((s[_R + 6 + n] << k >> k) << 9) - z >> 10) * i + half) >> shift)
         n += 1
+    # C = (TURN0, TURN1) / dt and PUSH / T, bounded, as counts of a gyro
     gain = s[_CC]
     shift = s[_CC_SHIFT]
     most = s[_TURN_MAX]
@@ -578,6 +600,9 @@ def learn(s: ptr32):
     m = x >> 8
     gain = s[_HC]
     s[_C + 2] = m * gain + ((x - (m << 8)) * gain >> 8) >> s[_HC_SHIFT]
+    # INFO -= T (INFO / 150 s)**2, and for each axis, with T = 1:
+    # at rest    INFO += 100, U = 100 (b - gyro)
+    # in motion  INFO += OM (y_n**2 + y_w**2) + 0.1 j z**2, U = OM (y_n C0 + y_w C1) + 0.1 j z C2
     still = s[_STILL] == s[_REST_AFTER]
     j = s[_J]
     om = s[_OM]
@@ -607,7 +632,7 @@ def learn(s: ptr32):
         s[_INFO + n] = x
         s[_U + n] = u
         n += 1
-    # the bias less U / INFO, and from it O, what the steps subtract: minus the bias as a half angle
+    # b -= U / INFO, within +-bias_limit; O = O_BASE - b dt / 2, what the steps add
     b_shift = s[_B_SHIFT]
     gain = s[_G]
     rest = s[_GR]

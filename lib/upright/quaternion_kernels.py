@@ -150,6 +150,7 @@ def take_sums(s: ptr32):
     fine = 12 - s[_BLOCK]
     i = 0
     while i < 3:
+        # H = HS / (steps * 1 g)
         x = s[_HS + i] << k >> k
         m = x >> 15
         x -= m << 15
@@ -182,6 +183,7 @@ def carry_errors(s: ptr32):
     k = 0
     if s[_PROBE] > 0:
         k = 32
+    # x_a -= R x_b
     x = s[_X + 3] << k >> k
     y = s[_X + 4] << k >> k
     z = s[_X + 5] << k >> k
@@ -202,10 +204,12 @@ def carry_errors(s: ptr32):
         s[_X + i] = (s[_X + i] << k >> k) - (m + half >> shift)
         i += 1
     shift = s[_B_SHIFT]
+    # v0 += x_a1 + H0 + x_v0; v1 += H1 + x_v1 - x_a0
     m = ((s[_X + 1] << k >> k) + 16 >> 5) + (s[_H] << k >> k) + (s[_X + 6] << k >> k)
     n = (s[_H + 1] << k >> k) + (s[_X + 7] << k >> k) - ((s[_X] << k >> k) + 16 >> 5)
     i = 0
     while i < 3:
+        # FOLDED = TURN = x_a, no more than 0.35 rad; b += x_b
         x = s[_X + i] << k >> k
         y = x
         if y > _FOLD_MOST:
@@ -251,6 +255,7 @@ def spread_bias(s: ptr32):
     half = 1 << shift >> 1
     j = 3
     while j < 8:
+        # P_aj -= R P_bj; N the same, half of it
         x = s[_P + at[24 + j]] << k >> k
         y = s[_P + at[32 + j]] << k >> k
         z = s[_P + at[40 + j]] << k >> k
@@ -288,6 +293,7 @@ def spread_attitude(s: ptr32):
     while i < 3:
         j = i
         while j < 3:
+            # P_ij -= row i of N times row j of R, and the other way round
             total = half
             u = 3 * i
             v = 3 * j
@@ -327,6 +333,7 @@ def spread_velocity(s: ptr32):
     if s[_PROBE] > 0:
         k = 32
     at = ptr8(_AT)
+    # P_vv += P_av + P_va + P_aa, by columns: P_v0j += P_a1j, P_v1j -= P_a0j
     a = s[_P]
     b = s[_P + 1] << k >> k
     c = s[_P + 8]
@@ -357,6 +364,7 @@ def add_noise(s: ptr32):
         k = 32
     at = ptr8(_AT)
     fine = s[_BLOCK]
+    # P_aa += gyro_noise**2 T + (scale_error |gyro|)**2 T, a quarter of the last sigma about the vertical
     m = 0
     i = 0
     while i < 3:
@@ -371,6 +379,7 @@ def add_noise(s: ptr32):
     s[_P] += x + m
     s[_P + 8] += x + m
     s[_P + 15] += x + (m >> 4)
+    # P_bb += bias_walk**2 T, up to the first variance
     x = s[_QBR] + s[_QB]
     s[_QBR] = x & 4095
     x >>= 12
@@ -418,6 +427,7 @@ def measure(s: ptr32):
     at = ptr8(_AT)
     h = s[_UH]
     mask = s[_UM]
+    # n = P_hh + r, S in the textbooks
     n = s[_P + at[9 * h]] + 8 >> 4
     n += s[_UR]
     f = 0
@@ -429,6 +439,7 @@ def measure(s: ptr32):
     r = (r + n // r) >> 1
     r = (r + n // r) >> 1
     r = 20480 * r >> (f >> 1)
+    # e = z - x_h, within 5 sigma; over: beyond 2.5
     e = (s[_UE] << k >> k) - (s[_X + h] << k >> k)
     c = r >> 1
     s[_OVER] = 0
@@ -441,6 +452,7 @@ def measure(s: ptr32):
     c = e >> 15
     e &= 32767
     # 1 / n = (r + d / 2**15) / 2**43: a quotient of 14 bits, and Newton's step for the rest
+    # K_i = P_ih / n, as M and E; x_i += K_i e
     r = 0x1FFFFFFF // (n + 8192 >> 14)
     h = n >> 15
     d = 0x10000000 - r * h - (r * (n - (h << 15)) >> 15)
@@ -582,6 +594,7 @@ def tilt_from_accel(s: ptr32):
     decided = (s[_DECIDED] | (_WIDE | _UNDER | _LEAN)) ^ (_WIDE | _UNDER | _LEAN)
     if s[_P] + s[_P + 8] > _WIDE_SUM:
         decided |= _WIDE
+        # meant = (H1, -H0), no part of it more than 2 g; upside down at least 1.5 rad
         most = 0
         total = 0
         i = 0
@@ -637,6 +650,7 @@ def after_tilt(s: ptr32) -> int:
         s[_V + 1] = 0
         s[_LOST] = 0
         return 2
+    # for three blocks the last corrections come through
     i = s[_WIDE_FOR]
     if i > 3:
         i = 3
@@ -645,6 +659,7 @@ def after_tilt(s: ptr32) -> int:
             i - 1
         )  # the last correction has to come through before the heading means something
     i = 0
+    # lost: beyond 2.5 sigma for a second
     if decided & _RUNAWAY:
         i = s[_LOST] + 1
     s[_LOST] = i
@@ -661,6 +676,7 @@ def weigh_field(s: ptr32):
     if s[_PROBE] > 0:
         k = 32
     j = s[_J]
+    # FIELD += k (NOW - FIELD), k = j T / (0.05 s + j T)
     rate = (j << 24) // ((j << 10) + s[_SMOOTH])  # Q14
     i = 0
     while i < 2:
@@ -702,6 +718,7 @@ def weigh_field(s: ptr32):
         else:
             i = 0
     s[_DECIDED] = decided
+    # NOISE = mag_noise**2 / (j T) (1 + min(8, (off / 0.1)**2))
     n = s[_RM] // j
     if off > 1310:
         off = 1310
@@ -709,6 +726,7 @@ def weigh_field(s: ptr32):
     if n > 0x20000000:
         n = 0x20000000
     s[_NOISE] = n
+    # good: near the reference for 0.3 s
     near = 0
     tau = s[_TAU_FAR]
     s[_GOOD] = 0
@@ -725,6 +743,7 @@ def weigh_field(s: ptr32):
     s[_AGE] = n
     if n <= s[_FIRST] and s[_GOOD] == 0:
         s[_GOOD] = 2
+    # REF += k (FIELD - REF), k = j T / (tau + j T); tau: 20 s, or 100 s, no more than AGE + 0.2 s
     n = (n << 10) + s[_TAU_0]
     if tau > n:
         tau = n
@@ -764,6 +783,7 @@ def ready_for_heading(s: ptr32) -> int:
     if e > _FAR_RAD or e < 0 - _FAR_RAD:
         decided |= _FAR_BIT
     s[_DECIDED] = decided
+    # far in a good field for 5 s: the heading is opened up
     n = s[_FAR]
     found = 1
     if decided & _FAR_BIT and s[_GOOD] == 1:
@@ -778,6 +798,7 @@ def ready_for_heading(s: ptr32) -> int:
             n = 0
     s[_FAR] = n
     x = s[_X + 2] << k >> k
+    # z = e - FOLDED2, the short way round from x
     e -= (s[_FOLDED + 2] << k >> k) + x
     if e > _PI25:
         e -= _PI25 << 1

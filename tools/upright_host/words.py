@@ -338,7 +338,7 @@ def places(state: str) -> SimpleNamespace:
 def written(text: str, module: str) -> str:
     """The module's text with the constants of the words that it uses, in order."""
     before, found, rest = text.partition(BEGIN)
-    old, ended, after = rest.partition(END)
+    _, ended, after = rest.partition(END)
     if not found or not ended:
         raise ValueError(
             f"{module}.py has no place for its words: {BEGIN.strip()} ... {END.strip()}"
