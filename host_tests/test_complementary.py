@@ -4,7 +4,6 @@ as far as it says."""
 import math
 import random
 from array import array
-from pathlib import Path
 
 import motions
 import numpy as np
@@ -15,10 +14,10 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from reference.complementary_float import EulerFloat
 from reference.mahony_float import angle_between
-from upright import complementary, euler_kernels
+from upright import euler_kernels
 from upright.complementary import Euler6
 from upright.mahony import Mahony6
-from upright_host import scoring, trials, words
+from upright_host import paths, scoring, trials, words
 from upright_host.simulate import best_runtime as quickest
 
 TURN = 1 << 30
@@ -241,7 +240,7 @@ def test_a_slow_turn_of_a_tilted_body_is_not_lost_by_rounding():
 
 
 # -- no overflow
-LIB = Path(AT._file__).parent
+LIB = paths.PACKAGE
 
 
 def extreme(rng, most):
@@ -252,7 +251,6 @@ def test_nothing_leaves_32_bits_at_the_corners_of_the_accepted_range():
     watch = overflow.Watch()
     paths = [LIB / "euler_kernels.py", LIB / "complementary.py"]
     kind = overflow.loaded(paths, watch)["complementary"].Euler6
-    c = complementary
     rng = random.Random(1)
     corners = []
     for scale, slow, fast in (((82, 5), 42, 89000), ((131, 1), 6, 11000)):
@@ -262,7 +260,7 @@ def test_nothing_leaves_32_bits_at_the_corners_of_the_accepted_range():
     for rate, scale, tau in corners:
         filter = kind(rate, scale, 2048, tau)
         s = filter.state
-        most = s[c._G] * 40960
+        most = s[AT.G] * 40960
         for i in range(120):
             if i % 4 == 0:
                 # anywhere, at the pole, and with the remainders at their ends
@@ -273,13 +271,13 @@ def test_nothing_leaves_32_bits_at_the_corners_of_the_accepted_range():
                     extreme(rng, TURN >> 2),
                     extreme(rng, ONE - 1),
                 )
-                s[c._A : c._A + 3] = array("i", angles)
+                s[AT.A : AT.A + 3] = array("i", angles)
                 if near:
-                    s[c._A + 1] = near - (near > 0) * rng.randint(0, 1 << 20)
+                    s[AT.A + 1] = near - (near > 0) * rng.randint(0, 1 << 20)
                 for j in range(3):
-                    s[c._AR + j] = s[c._WR + j] = rng.choice((0, 32767))
-                s[c._D] = extreme(rng, most + (TURN >> 2))
-                s[c._D + 1] = extreme(rng, most)
+                    s[AT.AR + j] = s[AT.WR + j] = rng.choice((0, 32767))
+                s[AT.D] = extreme(rng, most + (TURN >> 2))
+                s[AT.D + 1] = extreme(rng, most)
             row = [rng.choice((-32768, 32767, 0, rng.randint(-32768, 32767))) for _ in range(10)]
             row.append(rng.choice((0, 1, 1, 1, 5)))
             for j in range(3):
@@ -287,8 +285,8 @@ def test_nothing_leaves_32_bits_at_the_corners_of_the_accepted_range():
                     row[3 + j] = -32768 if filter.bias_set[j] > 0 else 32767
             filter.update(array("h", row))
             assert abs(math.hypot(*s[1:5]) / ONE - 1) < 1e-7
-            assert min(s[c._A], s[c._A + 2]) >= -ONE and max(s[c._A], s[c._A + 2]) < ONE
-            assert abs(s[c._A + 1]) <= (TURN >> 2) + 1
+            assert min(s[AT.A], s[AT.A + 2]) >= -ONE and max(s[AT.A], s[AT.A + 2]) < ONE
+            assert abs(s[AT.A + 1]) <= (TURN >> 2) + 1
     assert watch.missed() == []
     assert watch.functions == {
         "euler_kernels.sines",
