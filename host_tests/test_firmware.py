@@ -228,6 +228,51 @@ def test_a_stuck_bus_costs_time_not_the_program(boot):
     assert result["fresh"] > 700
 
 
+FAULTS = (
+    *("missed", "crashes", "step_errors", "errors", "resets", "fifo_overflows", "display_errors"),
+    *("mag_errors", "mag_resets"),
+)
+
+
+@pytest.mark.parametrize(
+    ("kind", "config"),
+    [
+        (
+            "fifo_overflows",
+            {
+                "board": {"DRIVE": "fifo", "SENSOR_RATE_HZ": 200, "FIFO_HZ": 50},
+                "faults": [
+                    [3 * SECOND, "bus", "stuck", True],
+                    [int(4.5 * SECOND), "bus", "stuck", False],
+                ],
+            },
+        ),
+        (
+            "mag_resets",
+            {"board_name": "robomaster_a", "faults": [[3 * SECOND, "mag", "brown_out"]]},
+        ),
+    ],
+)
+def test_every_kind_of_fault_is_in_the_count_that_the_display_shows(boot, kind, config):
+    result, *_ = boot(seconds=6, **config)
+    assert result["started"]
+    assert result[kind] > 0
+    assert result["faults"] == sum(result[name] for name in FAULTS if name in result)
+
+
+@pytest.mark.parametrize(("counts", "known"), [(327, True), (331, False)])
+def test_a_bias_that_no_sensor_has_is_taken_for_motion(boot, tmp_path, counts, known):
+    """PS 6.1: the zero-rate output is within 20 deg/s, 328 counts."""
+    from world import write_imu
+
+    path = tmp_path / "turning.imu"
+    row = np.array([0, 0, 4096, counts, -counts, counts, 0, 0, 0, 0, 0], "<i2")
+    write_imu(path, row.tobytes() * 2, "turning", (1, 2), 4096, (82, 5), False)
+    result, lines, *_ = boot(world=str(path), seconds=3, board={"KEEP_BIAS": False})
+    assert any("never at rest" in line for line in lines) is not known
+    assert result["bias_known"] is known
+
+
 def test_a_board_that_never_rests_goes_on_flagged(boot, tmp_path):
     import motions
 
