@@ -276,6 +276,23 @@ def test_without_its_bounds_it_would(monkeypatch):
         c.apply(sample(mag=(-32768, 0, 0)))
 
 
+def test_what_is_beyond_16_bits_is_their_last_number():
+    c = Calibration()
+    c.set({"mag": mag([2000000, 0, 0, 0, 2000000, 0, 0, 0, 2000000])})
+    c.apply(sample(mag=(-32768, 32767, -16385)))
+    assert list(c.counts[6:9]) == [-32768, 32767, -32768]
+
+
+@pytest.mark.parametrize(("ppm", "taken"), [(51000, True), (49000, False)])
+def test_a_matrix_may_flatten_an_axis_to_a_twentieth(ppm, taken):
+    fields = {"accel": accel([1000000, 0, 0, 0, 1000000, 0, 0, 0, ppm])}
+    if taken:
+        Calibration().set(fields)
+    else:
+        with pytest.raises(calibration.CalibrationError, match="singular"):
+            Calibration().set(fields)
+
+
 # ---------------------------------------------------------------------------------------- gyro bias
 @pytest.mark.parametrize("scale", [(131, 1), (131, 2), (164, 5), (82, 5)])
 def test_the_bias_comes_in_256ths_of_a_count_in_the_bodys_frame(scale):

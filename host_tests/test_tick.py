@@ -112,6 +112,35 @@ def test_missed_ticks_are_counted_and_coasted_through(tick, filter):
     assert tick.missed == 2
 
 
+def test_a_tick_exactly_a_period_late_is_the_one_after_a_missed_one(tick, filter):
+    ticks_at(tick, [5000, 10000, 20000])
+    assert filter.flags == [1, 1, 0, 1]
+    assert tick.missed == 1
+
+
+def test_what_was_made_up_for_before_a_stop_is_owed_no_more(tick, filter):
+    ticks_at(tick, [5000, 10000, 25000])
+    tick.resume()
+    ticks_at(tick, [60000, 62000])  # the second is early, and no late one of before
+    assert filter.flags == [1, 1, 0, 0, 1, 1, 1]
+    assert tick.missed == 2
+
+
+def test_a_magnetometer_on_its_own_bus_is_read_with_the_newest_packet(imu, filter):
+    class Mag:
+        def __init__(self):
+            self.reads = []
+
+        def read(self, counts):
+            self.reads.append(counts[0])
+
+    mag = Mag()
+    imu.packets = [1, 2, 3]
+    Tick(imu, filter, 0, mag=mag).on_fifo(None)
+    assert mag.reads == [3]
+    assert filter.words == [1, 2, 3]
+
+
 def test_ticks_that_were_made_up_for_and_come_late_are_not_stepped_twice(tick, filter, imu):
     # A callback held up to 25000; the port then runs the late ones one after the other (rp2 does).
     ticks_at(tick, [5000, 10000, 25000, 25100, 25200, 30000, 35000])
