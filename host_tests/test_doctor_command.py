@@ -107,7 +107,7 @@ LACKS = "inertial.py is not on this board"
     [
         ((), LACKS),
         (("__init__",), LACKS),
-        (("__init__", "settings", "mpu_common", "mpu_parts"), LACKS),
+        (("__init__", "settings", "mpu_monitor", "mpu_parts"), LACKS),
         (contents.library(BOARD.decode()), "nobody at 0x68"),
     ],
 )

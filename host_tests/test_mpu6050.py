@@ -66,11 +66,66 @@ def test_a_chip_on_the_other_address_is_pointed_out():
     driver(0x69).configure()
 
 
-def test_a_chip_that_is_late_after_power_up_is_waited_for():
+@pytest.mark.parametrize("address", [0x68, None])
+def test_a_chip_that_is_late_after_power_up_is_waited_for(address):
     chip = wired()
     chip.power_up_us = 90_000
     chip.brown_out(0)
-    driver().configure()
+    driver(address).configure()
+
+
+class Clock:
+    """A DS3231 on its address: it answers every register."""
+
+    def __init__(self, address=0x68):
+        self.address = address
+
+    def i2c_start(self, read, now):
+        return True
+
+    def i2c_write(self, byte, now):
+        return True
+
+    def i2c_read(self, now):
+        return 0x17
+
+    def i2c_stop(self, now):
+        pass
+
+    def poll(self, now):
+        pass
+
+
+@pytest.mark.parametrize("address", [0x68, 0x69])
+@pytest.mark.parametrize("clock", [False, True])
+def test_without_an_address_the_chip_is_found_at_either(address, clock):
+    wired(address=address)
+    if clock:
+        machine.wire_i2c(0, Clock(0x68 + 0x69 - address))
+    imu = MPU6050(machine.I2C(0))
+    imu.configure()
+    assert imu.registers.address == address and tick(imu) & FRESH
+
+
+def test_without_an_address_two_chips_are_refused_and_both_named():
+    wired()
+    wired(address=0x69, who_am_i=0x70)
+    with pytest.raises(
+        MPU6050Error, match=r"0x68 answers .* 0x68 and 0x69 with 0x70.*address=0x69"
+    ):
+        driver(None).configure()
+    driver(0x69).configure()
+
+
+def test_without_an_address_nobody_and_a_stranger_are_told():
+    with pytest.raises(MPU6050Error, match=r"no MPU6050 at 0x68 or 0x69.*pull-ups"):
+        driver(None).configure()
+    machine.wire_i2c(0, Clock(0x69))
+    with pytest.raises(
+        MPU6050Error, match=r"0x69 answers WHO_AM_I .* 0x17.*DS3231.*accept_unknown"
+    ):
+        driver(None).configure()
+    assert kernel.now() < 1_000_000
 
 
 def test_an_unknown_identity_is_refused_and_shown():
@@ -84,6 +139,7 @@ def test_an_unknown_identity_can_be_insisted_on():
     imu = driver(accept_unknown=True)
     imu.configure()
     assert imu.chip == "unknown (0x42)" and imu.who_am_i == 0x42
+    assert imu.fifo_size == 512  # the smallest of the family
     assert tick(imu) & FRESH
 
 
@@ -307,6 +363,45 @@ def test_temperature_is_exact_to_a_hundredth(raw):
     _, imu = running((0, 0, 0, 0, 0, 0, 0, 0, 0, raw))
     tick(imu)
     assert abs(imu.temperature_cdeg() - (raw / 340 + 36.53) * 100) <= 0.5001
+
+
+def test_a_program_gets_g_and_degrees_per_second_and_celsius():
+    _, imu = running((4096, -2048, 1024, 164, -82, 41, 0, 0, 0, -521))
+    tick(imu)
+    assert imu.accel() == (1.0, -0.5, 0.25)
+    assert imu.gyro() == pytest.approx((10, -5, 2.5))
+    assert imu.temperature() == pytest.approx(35, abs=0.01)
+
+
+# with
+
+
+def test_with_lets_the_chip_sleep_in_the_end_and_leaves_its_configuration():
+    chip = wired()
+    with driver() as imu:
+        imu.configure(sample_rate_hz=1000)
+        imu.fifo_enable()
+        kernel.advance(3000)
+        assert imu.fifo_poll() == 3
+    assert chip.register(PWR_MGMT_1) & 0x40 and chip.register(USER_CTRL) == 0
+    tick(imu)
+    assert not tick(imu) & FRESH
+    imu.wake()
+    assert tick(imu) & FRESH and list(imu.counts)[:10] == list(COUNTS)
+
+
+@pytest.mark.parametrize("configured", [True, False])
+def test_with_a_bus_that_fails_the_programs_own_exception_is_the_one_that_comes_out(configured):
+    chip = wired()
+    with pytest.raises(KeyboardInterrupt), driver() as imu:
+        if configured:
+            imu.configure()
+        chip.vanish()
+        raise KeyboardInterrupt
+    chip.come_back()
+    with pytest.raises(MPU6050Error, match="bus error"), driver() as imu:
+        imu.configure()
+        chip.vanish()
 
 
 # Faults in the tick

@@ -48,6 +48,7 @@ _GYRO_START_MS = const(30)
 _GYRO_START_6500_MS = const(35)
 
 _FLAGS = const(10)  # of counts
+_RESET = const(4)  # state of the monitor
 _COUNT_MASK = const(0x3FFFFFFF)
 
 
@@ -117,15 +118,13 @@ class Mpu:
         When there is none, or the bus fails, or the gyro has not settled after a repair, bit 0 is
         clear and the words keep what they held.
         """
+        if self.monitor.state:
+            return self._withheld()
         raw = self._raw
         try:
             self._read_into(_INT_STATUS, self._burst)
         except OSError:
             return self.monitor.fault()
-        if self.monitor.state:
-            if self._is_sample(raw):
-                self.monitor.withhold()
-            return self.counts[_FLAGS]
         counts = self.counts
         flags = unpack(raw, _HEAD, counts)
         if not flags:
@@ -137,6 +136,18 @@ class Mpu:
             flags |= device.take(raw, _HEAD + _PACKET, counts)
             counts[_FLAGS] = flags
         return flags
+
+    def _withheld(self):
+        """read() while the chip is repaired or the gyro settles."""
+        if self.monitor.state == _RESET:
+            return self.monitor.not_fresh()  # the chip is to be left alone
+        try:
+            self._read_into(_INT_STATUS, self._burst)
+        except OSError:
+            return self.monitor.fault()
+        if self._is_sample(self._raw):
+            self.monitor.withhold()
+        return self.counts[_FLAGS]
 
     def _is_sample(self, raw):
         """Is there a new sample? Answers everything else that INT_STATUS says."""

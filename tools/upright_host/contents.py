@@ -25,12 +25,14 @@ ARCHITECTURES = {
 MOVED = {
     **{name: f"upright.{name}" for name in (
         "attitude", "auxiliary_bus", "calibration", "complementary", "euler_kernels", "filters", "fixmath",
-        "inertial_kernels", "ist8310", "kalman", "mahony", "mpu6050", "mpu6500", "mpu_common", "mpu_parts",
-        "mpu_selftest", "mpu_setup", "quaternion_kalman", "quaternion_kernels", "ssd1306", "tick", "timing",
+        "inertial_kernels", "ist8310", "kalman", "mahony", "mpu6050", "mpu6500", "mpu_parts",
+        "mpu_selftest", "quaternion_kalman", "quaternion_kernels", "ssd1306", "tick", "timing",
     )},
     **{name: f"upright_app.{name}" for name in ("app", "axis_check", "bias", "doctor", "pages", "record")},
     "config": "upright.settings",
     "inertial_mahony": "upright.inertial",
+    "mpu_common": "upright.mpu_monitor",
+    "mpu_setup": "upright.mpu",
     "mpu_dmp": "upright.dmp",
     "mpu_dmp_image": "upright.dmp_image",
     "mpu_dmp_setup": "upright.dmp_setup",

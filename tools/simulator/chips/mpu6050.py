@@ -111,6 +111,10 @@ class MPU6050Chip(Sensors):
     def fifo_count(self):
         return self.fifo.count
 
+    def jam(self):
+        """Until the next reset no sample is taken, while every register answers as before."""
+        self._next_us = None
+
     @property
     def awake(self):
         """Sampling: not asleep, and with a clock (CLKSEL 7 stops it, RM 4.28)."""
