@@ -499,3 +499,21 @@ def test_attitude_from_up_agrees_with_the_arc_tangents_to_a_hundredth_of_a_degre
     q = fixmath.attitude_from_up(x, y, z)
     assert mahony_float.angle_between(q, from_euler(roll, pitch, 0, "zyx")) < 1e-5
     assert math.hypot(*q) / ONE == pytest.approx(1, abs=5e-9)
+
+
+# ---------------------------------------------------------------- scaled words
+
+
+@pytest.mark.parametrize(
+    "num, den", [(1, 1), (1, 4096), (1 << 23, 12345678901234), (999, 1000), (1, 3), (7, 1 << 40)]
+)
+def test_words_times_a_factor_are_right_to_the_last_bit(num, den):
+    k = fixmath.scale(2, num, den)
+    for value in (0, 1, -1, 12345, -54321, 1 << 29, -(1 << 29), (1 << 30) - 1, -(1 << 30)):
+        state = array("i", [7, 7, value, -value, value // 3, 7])
+        out = array("i", [100, -100, 0])
+        fixmath.add_scaled(state, out, k)
+        for got, base, word in zip(out, (100, -100, 0), state[2:5], strict=True):
+            exact = word * num / den
+            # one for the limbs' and one for the last rounding; the factor has 29 bits
+            assert abs(got - base - exact) <= 2.01 + abs(exact) * 2**-28

@@ -19,7 +19,7 @@ from chips.mpu6500 import MPU6500Chip
 from chips.ssd1306 import SSD1306Chip
 from rich.console import Console
 from upright_host import bench as bench_command
-from upright_host import console, emulated, replay, runtimes, scoring, tracing, trials
+from upright_host import console, emulated, paths, replay, runtimes, scoring, tracing, trials
 from upright_host import rp2040 as firmware
 from world import StillWorld, World
 
@@ -441,6 +441,23 @@ def test_the_fifo_drive_in_a_hard_interrupt_loses_nothing(nine):
     assert abs(mag_fresh - steps / 2) <= 2
     assert not any(faults), faults
     assert nine.imu.misuse == []
+
+
+# ---------------------------------------------------------------- a program of one's own
+def test_a_program_with_asyncio_gets_every_reading_beside_its_other_tasks(image, version):
+    files = emulated.project(version)
+    files["main.py"] = (paths.ROOT / "docs" / "examples" / "with_asyncio.py").read_bytes()
+    board = rp2040.Board(image, files)
+    world = StillWorld((0, 0, 4096))
+    board.i2c(0, sda=4, scl=5).add(MPU6050Chip(world))
+    board.boot()
+    board.start(world)
+    board.expect("reading 100 ", 20)
+    said = [line.split() for line in board.console.splitlines()]
+    readings = [words for words in said if words[:1] == ["reading"]]
+    assert [int(words[4]) for words in readings] == [50, 100]  # none was missed
+    assert all(abs(float(word)) < 1 for words in readings for word in words[6:])
+    assert sum(words[:2] == ["other", "task"] for words in said) >= 1
 
 
 # ---------------------------------------------------------------- the bench: the emulated board itself

@@ -49,7 +49,7 @@ class Bias:
         bias = ahrs.calibration.gyro_bias()
         if bias is None:
             return False
-        ahrs.filter.set_bias(*bias)
+        ahrs.filter.set_bias(*bias)  # of another day: not known as a measured one is
         self.known = True
         ahrs.log("bias: from", ahrs.settings.CALIBRATION)
         return True
@@ -121,7 +121,7 @@ class Bias:
                 and max(spread[3:]) <= gyro_most
                 and max(abs(m) for m in mean) <= 256 * bias_most
             ):
-                ahrs.filter.set_bias(*mean)
+                ahrs.filter.set_bias(*mean, _REST_WINDOW_MS / 1000)
                 ahrs.log("bias: %s mdeg/s" % ([m * 1000 * den // (256 * num) for m in mean],))
                 return True
             if k + 1 < tries:

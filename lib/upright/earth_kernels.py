@@ -307,6 +307,8 @@ class EarthFilter(Attitude):
         s[_REST_GYRO] = self.counts(p["rest_gyro_dps"], 8) ** 2
         s[_REST_ACCEL] = fixmath.ratio(p["rest_accel_g"] * 8 * accel_lsb_per_g, MILLION) ** 2
         self.set_up(p, parameters)
+        num, den = self.bias_unit
+        self._bias_scale = fixmath.scale(_B, num << 8, den)
         self.set_bias(0, 0, 0)
         self.start_at((fixmath.ONE, 0, 0, 0))
 
@@ -373,11 +375,11 @@ class EarthFilter(Attitude):
         self.bias_is_new(known_s)
 
     def bias(self, out):
-        """The gyro's bias, set and learnt, in 1/256 of a gyro count: out[0..2]. It may allocate."""
-        num, den = self.bias_unit
+        """The gyro's bias, set and learnt, in 1/256 of a gyro count: out[0..2]. Allocates nothing."""
         s = self.state
         for i in range(3):
-            out[i] = s[_BASE + i] + fixmath.ratio(s[_B + i] * num << 8, den)
+            out[i] = s[_BASE + i]
+        fixmath.add_scaled(s, out, self._bias_scale)
 
     def bias_mdps(self, out):
         """The gyro's bias, set and learnt, in millidegrees/s: out[0..2]. It may allocate."""

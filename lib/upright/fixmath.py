@@ -465,7 +465,33 @@ def euler(q, out, order="zyx"):
         raise ValueError("order %r is not 'zyx' or 'zxy'" % (order,))
 
 
+@micropython.viper
+def add_scaled(s: ptr32, out: ptr32, k: ptr32):
+    """out[0..2] += three words of s, each within +-2**30, times a factor: k, of scale()."""
+    at = k[0]
+    high = k[1]
+    low = k[2]
+    shift = k[3]
+    half = 1 << shift >> 1
+    i = 0
+    while i < 3:
+        a = ((s[at + i] >> 15 & 0x1FFFF) ^ 0x10000) - 0x10000
+        b = s[at + i] & 0x7FFF
+        product = a * high + (a * low >> 15) + (b * high >> 15)
+        out[i] = out[i] + ((product + half) >> shift)
+        i += 1
+
+
 # ----------------------------------------------------------------------------- set-up: allocates
+def scale(at, num, den):
+    """array('i') for add_scaled: the words from s[at] on times num/den, which is 1 at the most, to 29 bits."""
+    shift = 0
+    while shift < 30 and num << (shift + 1) <= den:
+        shift += 1
+    factor = ratio(num << (30 + shift), den)
+    return array("i", [at, factor >> 15, factor & 0x7FFF, shift])
+
+
 def isqrt(n):
     """The integer part of the square root of n >= 0, of any size."""
     if n < 2:

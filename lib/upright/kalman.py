@@ -262,6 +262,8 @@ class Kalman6(Euler6):
                     16383 / (1 << (15 + shift)),
                 )
             )
+        gain = (s[_G] << 15) + s[_GR]
+        self._bias_scale = fixmath.scale(_I, 1 << 23, gain << shift)
         s[_K] = pair[0]
         s[_K_SHIFT] = pair[1] - 14
         s[_K2] = bias_pair[0]
@@ -274,11 +276,10 @@ class Kalman6(Euler6):
             self.state[_I + i] = self.state[_IR + i] = 0
 
     def bias(self, out):
-        """The gyro's bias, set and learnt, in 1/256 of a gyro count: out[0..2]. For the main loop: it may allocate."""
-        s = self.state
-        gain = (s[_G] << 15) + s[_GR]
+        """The gyro's bias, set and learnt, in 1/256 of a gyro count: out[0..2]. Allocates nothing."""
         for i in range(3):
-            out[i] = self.bias_set[i] + fixmath.ratio(s[_I + i] << 23, gain << s[_I_SHIFT])
+            out[i] = self.bias_set[i]
+        fixmath.add_scaled(self.state, out, self._bias_scale)
 
     def bias_mdps(self, out):
         """The gyro's bias, set and learnt, in millidegrees/s: out[0..2]. For the main loop: it may allocate."""
