@@ -1,8 +1,11 @@
 """Packages for mip: up to date, complete each by itself, and installable from an index."""
 
+import ast
 import functools
 import http.server
+import itertools
 import json
+import re
 import shutil
 import subprocess
 import threading
@@ -52,6 +55,34 @@ def test_a_module_can_be_imported_with_its_package_alone(name, tmp_path):
         text=True,
     )
     assert done.returncode == 0, done.stderr
+
+
+def needs(name):
+    """The modules that the header of a module names behind "Needs"."""
+    lines = itertools.takewhile(
+        lambda line: line.startswith("#"), (paths.PACKAGE / f"{name}.py").read_text().splitlines()
+    )
+    header = " ".join(line.lstrip("# ") for line in lines)
+    said = re.search(r"Needs (.*?)\.(?= [A-Z]|$)", header)
+    assert said, f"{name}.py: its header does not say what it needs"
+    return set(re.findall(r"(\w+)\.py", said[1]))
+
+
+@pytest.mark.parametrize("name", packages.names())
+def test_what_a_header_says_that_a_module_needs_is_what_it_needs(name):
+    tree = ast.parse((paths.PACKAGE / f"{name}.py").read_text())
+    assert needs(name) == packages.imports(tree), f"{name}.py: Needs ... (left) and imports (right)"
+
+
+def test_the_headers_lead_to_all_that_a_package_holds():
+    for name in packages.names():
+        found, wanted = {"__init__"}, [name]
+        while wanted:
+            module = wanted.pop()
+            if module not in found:
+                found.add(module)
+                wanted += [*needs(module), *packages.TOGETHER.get(module, ())]
+        assert found == set(packages.modules(name))
 
 
 def test_the_mpu6500_comes_with_its_magnetometer():

@@ -119,7 +119,7 @@ def test_an_older_board_is_moved_over_and_keeps_what_is_its_users(flashed, keep,
 def test_the_flashed_board_gives_angles_beside_a_tutorials_modules(image, flashed, keep):
     board = transport.EmulatedTransport(transport.pico(image, keep.read_bytes()))
     board.exec("import time, upright\nimu = upright.start()\ntime.sleep_ms(300)")
-    assert board.eval("imu.status().steps") > 40
+    assert board.eval("imu.status()['steps']") > 40
     assert [abs(angle) < 1 for angle in board.eval("tuple(imu.angles())")] == [True] * 3
 
 

@@ -1,5 +1,5 @@
 # AHRS: sensor, calibration, filter and tick as one object that a program holds; attitude and heading in degrees.
-# Needs the modules that it imports, a filter of filters.py, and timing.py for every drive but the manual one.
+# Needs bias.py, calibration.py, filters.py and the module of its filter, reading.py, settings.py, tick.py, timing.py.
 # Every port. Set-up and readings may allocate and use floats; what the tick runs does neither.
 
 import math

@@ -1,5 +1,5 @@
 # The auxiliary I2C bus of an MPU6050 or MPU6500: the chip's own master, on its pins AUX_CL and AUX_DA.
-# Needs registers.py and the configured driver of the chip (mpu6050.py or mpu6500.py). Runs on MicroPython >= 1.22
+# Needs registers.py; the configured driver of the chip is handed in. Runs on MicroPython >= 1.22
 # and under CPython with a `micropython` shim. RM is RM-MPU-6000A rev 4.2; RM-MPU-6500A has the same master.
 
 import time

@@ -1,5 +1,5 @@
 # The gyro's bias: measured or taken from the calibration file at the start, and kept there when a filter has learnt it.
-# Part of ahrs.py, whose sensor, filter, calibration and settings it works with. Every port.
+# Needs an AHRS, with whose sensor, filter, calibration and settings it works. Every port.
 
 import time
 from array import array

@@ -1,6 +1,7 @@
 # The Digital Motion Processor of the InvenSense MPU6050 family: loads an image that the user hands over, reads
-# quaternion, accelerometer and gyro from its packets. Needs a driver (mpu6050.py, mpu6500.py) and fixmath.py. The
-# image is InvenSense's and not part of this library. Runs on MicroPython >= 1.22 and, with a stand-in, on CPython.
+# quaternion, accelerometer and gyro from its packets. Needs dmp_image.py, dmp_setup.py, mpu.py and mpu_monitor.py; a
+# driver is handed in. The image is InvenSense's and not part of this library. Runs on MicroPython >= 1.22 and, with a
+# stand-in, on CPython.
 
 import time
 

@@ -1,5 +1,5 @@
 # The set-up half of the DMP's driver: loading an image, starting it, judging whether it runs.
-# Needs a driver (mpu6050.py, mpu6500.py), dmp_image.py, attitude.py and fixmath.py; dmp.py has the tick. Runs on
+# Needs attitude.py, dmp_image.py, fixmath.py and mpu_fifo.py; a driver is handed in. Runs on
 # MicroPython >= 1.22 and under CPython with a `micropython` shim.
 
 import math

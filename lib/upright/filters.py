@@ -1,4 +1,5 @@
-# The filters that the firmware and the host tools can choose from, by name. Every port.
+# The filters that the firmware and the host tools can choose from, by name. Needs the modules of those that
+# are made, and no others. Every port.
 
 # name: (module, class) of lib/; a module is imported when one of its filters is made, so that the others take no memory
 FILTERS = {

@@ -1,5 +1,5 @@
 # Kalman filters with steady gains in 32-bit integers: one for any angle or number, and one for attitude that learns the
-# gyro's bias. Needs attitude.py, fixmath.py, complementary.py, euler_kernels.py and the viper emitter. update() is made
+# gyro's bias. Needs attitude.py, fixmath.py, complementary.py and the viper emitter. update() is made
 # for a hard interrupt: it allocates nothing, raises nothing, uses no float, and gives the same bits on every port.
 
 from array import array

@@ -1,5 +1,5 @@
 # The driver of the InvenSense MPU6050 family, put together from its parts: registers, table, monitor and FIFO.
-# Needs mpu_parts.py, mpu_table.py, mpu_monitor.py, mpu_fifo.py and a port from mpu6050.py or mpu6500.py. Runs on
+# Needs mpu_parts.py, mpu_table.py, mpu_monitor.py, mpu_fifo.py, and mpu_selftest.py for a self-test. Runs on
 # MicroPython >= 1.22 and under CPython with a `micropython` shim. RM is RM-MPU-6000A rev 4.2, PS PS-MPU-6000A
 # rev 3.4, RM-6500 RM-MPU-6500A rev 2.1.
 

@@ -1,6 +1,6 @@
 # Driver of the InvenSense MPU6050 on I2C, and of the parts that are sold under its name.
-# Needs an I2C object (machine.I2C or alike), mpu.py with its parts, and registers.py. Runs on MicroPython >= 1.22
-# and under CPython with a `micropython` shim. RM is RM-MPU-6000A rev 4.2.
+# Needs an I2C object (machine.I2C or alike), mpu.py, mpu_monitor.py, mpu_parts.py and registers.py. Runs on
+# MicroPython >= 1.22 and under CPython with a `micropython` shim. RM is RM-MPU-6000A rev 4.2.
 
 import time
 

@@ -1,6 +1,6 @@
 # Driver of the InvenSense MPU6500 on SPI, and of its family (MPU9250, ICM-20689 ...); on I2C as well.
-# Needs an SPI object and a chip select pin, mpu.py with its parts, mpu6050.py and registers.py. Runs on MicroPython
-# >= 1.22 and under CPython with a `micropython` shim. PS is PS-MPU-6500A rev 1.3, RM RM-MPU-6500A rev 2.1.
+# Needs an SPI object and a chip select pin, mpu.py, mpu6050.py, mpu_monitor.py, mpu_parts.py and registers.py. Runs on
+# MicroPython >= 1.22 and under CPython with a `micropython` shim. PS is PS-MPU-6500A rev 1.3, RM RM-MPU-6500A rev 2.1.
 
 import time
 

@@ -1,5 +1,5 @@
 # Packets of an MPU6050 or MPU6500: how a sample is unpacked, and the chip's FIFO, drained in whole packets.
-# Needs registers.py, mpu_table.py and mpu_monitor.py's objects. Runs on MicroPython >= 1.22 and under CPython with
+# Needs mpu_monitor.py; registers and table are handed in. Runs on MicroPython >= 1.22 and under CPython with
 # a `micropython` shim. RM is RM-MPU-6000A rev 4.2.
 
 import micropython

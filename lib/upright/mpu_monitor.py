@@ -1,6 +1,6 @@
 # Watches over the registers of an MPU6050 or MPU6500 in the tick and repairs what a reset of the chip has undone.
-# Needs registers.py and mpu_table.py's objects. Runs on MicroPython >= 1.22 and under CPython with a `micropython`
-# shim. RM is RM-MPU-6000A rev 4.2.
+# Needs the registers and the table that are handed in. Runs on MicroPython >= 1.22 and under CPython with a
+# `micropython` shim. RM is RM-MPU-6000A rev 4.2.
 
 import time
 

@@ -1,5 +1,5 @@
 # What the parts of the MPU6050 family are called, can be set to, and how their filters and rates go together.
-# Tables and set-up arithmetic in integers; needs nothing. Runs on MicroPython >= 1.22 and under CPython.
+# Tables and set-up arithmetic in integers. Needs nothing. Runs on MicroPython >= 1.22 and under CPython.
 # RM is RM-MPU-6000A rev 4.2, RM-6500 RM-MPU-6500A rev 2.1.
 
 # Temperature in hundredths of a degC as (raw * a + b / 2) // b + c

@@ -1,5 +1,5 @@
 # The self-tests of the MPU6050 and of the MPU6500 family; imported when one is run.
-# Needs mpu_fifo.py and a driver of mpu.py. Runs on MicroPython >= 1.22 and under CPython with a `micropython` shim.
+# Needs mpu_fifo.py; a driver is handed in. Runs on MicroPython >= 1.22 and under CPython with a `micropython` shim.
 # RM is RM-MPU-6000A rev 4.2, AN AN-MPU-9250A-03 rev 1.0, whose test the MPU6500 shares.
 
 import time

@@ -1,5 +1,5 @@
 # The configuration of a chip as a table of rows: register, value, and the bits that are compared.
-# Needs registers.py's objects. Runs on MicroPython >= 1.22 and under CPython.
+# Needs the registers that are handed in. Runs on MicroPython >= 1.22 and under CPython.
 
 
 class RegisterTable:

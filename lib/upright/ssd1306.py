@@ -1,5 +1,5 @@
 # Driver of SSD1306 and SH1106 OLED displays on I2C or SPI; it allocates nothing once it is set up.
-# Needs canvas.py and font.py of this package, viper, and a bus with `writeto` (I2C) or `write`
+# Needs canvas.py, viper, and a bus with `writeto` (I2C) or `write`
 # (SPI); runs on boards, the unix port and, with the host shim, CPython. Section numbers are those
 # of the SSD1306 datasheet, rev 1.1; what differs on the SH1106 is from its own, v2.3.
 

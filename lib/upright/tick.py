@@ -1,6 +1,6 @@
 # The tick: sample, filter, published state, a bounded piece of the display. Runs in a hard interrupt.
-# Needs a driver of lib/ (read, health, counts), a filter of lib/ (update, state) and viper; where the board has them, a
-# calibration (apply, counts) and a magnetometer on a bus of the tick (read). Every port.
+# Needs fixmath.py and viper. A driver (read, health, counts) and a filter (update, state) are handed in; where the
+# board has them, a calibration (apply, counts) and a magnetometer on a bus of the tick (read). Every port.
 
 from array import array
 from time import ticks_add, ticks_diff, ticks_us

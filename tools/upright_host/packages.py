@@ -18,7 +18,7 @@ from upright_host import __version__, paths, runtimes
 
 # What belongs beside a module without being imported by it: an MPU6500 mostly has an IST8310 behind it, a DMP is in a
 # chip, and the registry of the filters imports the default by its name.
-_TOGETHER = {
+TOGETHER = {
     "mpu6500": ("ist8310",),
     "ist8310": ("auxiliary_bus",),
     "dmp": ("mpu6050",),
@@ -42,7 +42,7 @@ def modules(name: str) -> list[str]:
         if module not in found:
             found.add(module)
             wanted += imports(ast.parse((paths.PACKAGE / f"{module}.py").read_text()))
-            wanted += _TOGETHER.get(module, ())
+            wanted += TOGETHER.get(module, ())
     return sorted(found)
 
 
