@@ -91,7 +91,7 @@ def flashed(image, keep, new, old):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(transport, "pico", pico)
-        done = CliRunner().invoke(cli.app, ["flash", "pico", "--emulated", "--seconds", "0.6"])
+        done = CliRunner().invoke(cli.app, ["flash", "pico", "--emulated", "--seconds", "1.5"])
     return done, snapshots[0].taken
 
 
