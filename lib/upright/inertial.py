@@ -1,5 +1,5 @@
 # The inertial-frame Mahony filter in 32-bit integers: sensor counts in, quaternion out, with its own gyro bias and its
-# own judgement of the magnetic field. Needs attitude.py, fixmath.py, earth_kernels.py, inertial_kernels.py and the
+# own judgement of the magnetic field. Needs fixmath.py, earth_kernels.py, inertial_kernels.py and the
 # viper emitter. update() is made for a hard interrupt: it allocates nothing, raises nothing, uses no float, and gives
 # the same bits on every port.
 

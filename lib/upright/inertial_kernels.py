@@ -1,5 +1,5 @@
 # Integer kernels of the inertial-frame Mahony filter (inertial.py): levelling, rest, gyro bias, magnetic field. Needs
-# the viper emitter; earth_kernels.py has what is not this filter's alone, and what a state and a block are. All of it
+# the viper emitter. In earth_kernels.py is what is not this filter's alone, and what a state and a block are. All of it
 # is made for a hard interrupt: it allocates nothing, raises nothing, uses no float, and gives the same bits on every
 # port. K, T, y ...: the names of the equations in docs/methods.md; the float twin is host_tests/reference.
 

@@ -1,5 +1,5 @@
 # The multiplicative quaternion Kalman filter in 32-bit integers: sensor counts in, quaternion out, with the gyro's bias
-# and with variances that say how well all of it is known. Needs attitude.py, fixmath.py, earth_kernels.py,
+# and with variances that say how well all of it is known. Needs fixmath.py, earth_kernels.py,
 # quaternion_kernels.py and the viper emitter. update() is made for a hard interrupt: it allocates nothing, raises
 # nothing, uses no float, and gives the same bits on every port.
 

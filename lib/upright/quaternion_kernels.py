@@ -1,7 +1,7 @@
 # Integer kernels of the quaternion Kalman filter (quaternion_kalman.py): the covariance, its propagation and scalar
-# measurements; rest and magnetic field. Needs the viper emitter; earth_kernels.py has what is not this filter's alone,
-# and what a state and a block are. All of it is made for a hard interrupt: it allocates nothing, raises nothing, uses
-# no float, and gives the same bits on every port.
+# measurements; rest and magnetic field. Needs the viper emitter. In earth_kernels.py is what is not this filter's
+# alone, and what a state and a block are. All of it is made for a hard interrupt: it allocates nothing, raises nothing,
+# uses no float, and gives the same bits on every port.
 #
 # The error state x, true less estimated:
 #     0 1 2  attitude, rotation vector in the earth frame     2**-15 rad

@@ -16,11 +16,12 @@ import typer
 
 from upright_host import __version__, paths, runtimes
 
-# What belongs beside a module without being imported by it: an MPU6500 mostly has an IST8310 behind it, a DMP is in a
-# chip, and the registry of the filters imports the default by its name.
+# What belongs beside a module without being imported by it: an MPU6500 mostly has an IST8310 behind it, on its
+# auxiliary bus; a DMP is in a chip; and the registry of the filters imports the default by its name.
 TOGETHER = {
     "mpu6500": ("ist8310",),
     "ist8310": ("auxiliary_bus",),
+    "magnetometer": ("auxiliary_bus",),
     "dmp": ("mpu6050",),
     "filters": ("inertial",),
 }
