@@ -65,6 +65,10 @@ class Rig:
     def configure(self, **arguments):
         self.mag.configure(sample_rate=self.rate if self.mag.own_bus else None, **arguments)
 
+    def start(self):
+        self.configure()
+        self.until(MAG_FRESH)
+
     def tick(self, health=True):
         kernel.advance(self.period - kernel.now() % self.period)
         self.imu.read()
@@ -100,11 +104,6 @@ def rig(request):
 @pytest.fixture(params=BEHIND)
 def behind(request):
     return Rig(request.param)
-
-
-@pytest.fixture
-def own():
-    return Rig("own bus", rate=200)
 
 
 def gaps(ticks):
@@ -244,8 +243,7 @@ def test_what_the_chip_cannot_do_is_refused(arguments, what):
 
 
 def test_every_measurement_is_delivered_once(rig):
-    rig.configure()
-    rig.until(MAG_FRESH)
+    rig.start()
     ticks = rig.run(1000)
     assert len(ticks) == 100
     assert gaps(ticks) == {10}
@@ -278,16 +276,14 @@ def test_a_program_gets_microteslas(rig):
 
 
 def test_read_does_nothing_where_the_imu_brings_the_measurement(behind):
-    behind.configure()
-    behind.until(MAG_FRESH)
+    behind.start()
     counts = array("h", range(11))
     assert behind.mag.read(counts) == 10
     assert list(counts) == list(range(11))
 
 
 def test_between_measurements_the_words_stay_and_bit_1_is_clear(rig):
-    rig.configure()
-    rig.until(MAG_FRESH)
+    rig.start()
     rig.world.set((0, 0, 4096, 0, 0, 0, 7, 8, 9))
     flags = rig.tick()
     assert flags & FRESH and not flags & MAG_FRESH
@@ -314,8 +310,7 @@ def test_the_fifo_carries_it_too(behind):
 
 
 def test_a_field_beyond_the_range_is_withheld_and_counted(rig):
-    rig.configure()
-    rig.until(MAG_FRESH)
+    rig.start()
     for word in range(3):
         field = [0, 0, 0]
         field[word] = -8192 if word == 2 else -5281  # z is out of 14 bits before it is out of range
@@ -372,8 +367,7 @@ def test_a_measurement_that_ends_at_any_moment_of_the_round_is_delivered_once_an
 def test_without_dren_measurements_are_still_found_by_their_data():
     """The IST8310 example that is widely copied writes CNTL2 = 0, and with it DRDY is never set."""
     rig = Rig("i2c", Moving())
-    rig.configure()
-    rig.until(MAG_FRESH)
+    rig.start()
     rig.mag_chip.poke(CNTL2, 0)
     fresh = rig.mag.fresh
     for _ in range(100):
@@ -442,8 +436,7 @@ def test_bytes_that_a_silent_magnetometer_leaves_behind_are_not_used_again(behin
 
 
 def test_a_bus_that_nobody_drives_is_no_measurement(rig):
-    rig.configure()
-    rig.until(MAG_FRESH)
+    rig.start()
     counts = rig.imu.counts
     for status, byte in ((0xFF, 0xFF), (0x00, 0x00), (0x01 | 0x80, 0x12), (0x00, 0x00)):
         raw = bytes([status]) + bytes([byte]) * 6
@@ -477,8 +470,7 @@ def test_absent_at_the_start_it_is_found_and_configured_by_the_tick(rig):
 
 
 def test_vanishing_in_flight_and_coming_back(rig):
-    rig.configure()
-    rig.until(MAG_FRESH)
+    rig.start()
     rig.mag_chip.vanish()
     rig.run(2)
     assert rig.run(1000) == []
@@ -495,8 +487,7 @@ def test_vanishing_in_flight_and_coming_back(rig):
 
 
 def test_a_reset_of_the_magnetometer_alone_is_noticed_and_mended(rig):
-    rig.configure()
-    rig.until(MAG_FRESH)
+    rig.start()
     rig.mag_chip.power_up_us = 50_000
     rig.mag_chip.brown_out(kernel.now())
     assert rig.until(MAG_FRESH) < 500_000
@@ -510,8 +501,7 @@ def test_a_reset_of_the_magnetometer_alone_is_noticed_and_mended(rig):
 
 @pytest.mark.parametrize("both", [False, True])
 def test_a_reset_of_the_imu_in_flight(rig, both):
-    rig.configure()
-    rig.until(MAG_FRESH)
+    rig.start()
     rig.chip.log = log = []
     rig.chip.brown_out(kernel.now())
     if both:
@@ -532,8 +522,7 @@ def test_a_reset_of_the_imu_in_flight(rig, both):
 
 
 def test_an_identity_lost_in_flight_is_mended_by_a_soft_reset(rig):
-    rig.configure()
-    rig.until(MAG_FRESH)
+    rig.start()
     rig.mag_chip._registers[WAI] = 0x11
     rig.run(1000)
     assert rig.mag_chip.register(WAI) == 0x10
@@ -543,8 +532,7 @@ def test_an_identity_lost_in_flight_is_mended_by_a_soft_reset(rig):
 
 
 def test_while_a_register_is_wrong_nothing_is_delivered(rig):
-    rig.configure()
-    rig.until(MAG_FRESH)
+    rig.start()
     rig.mag_chip.stick(PDCNTL, 0x00)
     while not rig.mag.resets:
         rig.tick()
@@ -555,8 +543,7 @@ def test_while_a_register_is_wrong_nothing_is_delivered(rig):
 
 
 def test_one_missing_acknowledge_costs_one_measurement_at_the_most(rig):
-    rig.configure()
-    rig.until(MAG_FRESH)
+    rig.start()
     for after in range(0, 90, 3):
         rig.mag_chip.nack_next(1, after)
         # a start that was lost is given again when the measurement is overdue: 13 samples and one measurement
@@ -565,8 +552,7 @@ def test_one_missing_acknowledge_costs_one_measurement_at_the_most(rig):
 
 
 def test_one_look_at_a_register_that_fails_costs_nothing(rig, monkeypatch):
-    rig.configure()
-    rig.until(MAG_FRESH)
+    rig.start()
     write = rig.mag_chip.i2c_write
     refused = []
 
@@ -586,8 +572,7 @@ def test_one_look_at_a_register_that_fails_costs_nothing(rig, monkeypatch):
 
 @pytest.mark.parametrize("seed", range(2))
 def test_a_storm_of_missing_acknowledges_costs_measurements_and_nothing_else(rig, seed):
-    rig.configure()
-    rig.until(MAG_FRESH)
+    rig.start()
     state = seed + 1
     for _ in range(1000):
         state = state * 1103515245 + 12345 & 0x7FFFFFFF
@@ -632,8 +617,7 @@ def test_configure_again_with_another_rate(behind):
     assert gaps(behind.run(400)) == {20}
     behind.imu.configure(sample_rate_hz=1000)
     assert behind.run(50) == []
-    behind.configure()
-    behind.until(MAG_FRESH)
+    behind.start()
     assert gaps(behind.run(300)) == {10}
     assert behind.imu.resets == 0
     assert behind.chip.misuse == []
@@ -644,8 +628,7 @@ def test_configure_again_with_another_rate(behind):
 
 def test_on_a_bus_of_its_own_it_is_left_alone_while_it_measures():
     rig = Rig("own bus")
-    rig.configure()
-    rig.until(MAG_FRESH)
+    rig.start()
     busy = []
     for _ in range(10):
         before = rig.bus.bytes
@@ -657,8 +640,7 @@ def test_on_a_bus_of_its_own_it_is_left_alone_while_it_measures():
 
 def test_on_a_bus_of_its_own_a_trigger_that_was_lost_is_given_again():
     rig = Rig("own bus")
-    rig.configure()
-    rig.until(MAG_FRESH)
+    rig.start()
     rig.mag_chip.poke(CNTL1, 0)  # stops a measurement under way
     rig.run(5)
     rig.mag_chip.poke(CNTL1, 0)

@@ -112,9 +112,7 @@ class AHRS:
         self._driver = self.sensor = sensor
         self._magnetometer = magnetometer
         self.magnetometer = None
-        self._own_mag = (
-            None  # the same, where it is read by itself and not with the sensor's sample
-        )
+        self._own_mag = None  # the same, where it is on a bus of its own
         self._data_ready = data_ready
         self._timer = timer
         self._on_step = on_step

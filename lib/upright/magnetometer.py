@@ -136,9 +136,8 @@ class Magnetometer:
         self._registers.error_class = self.error_class
         self._registers.name = self._name
         self._state = array("i", [0] * _WORDS)
-        self._kept = bytearray(
-            12
-        )  # for take(): the data that were used last, and those of the sample before
+        # for take(): the data that were used last, and those of the sample before
+        self._kept = bytearray(12)
         self._set_rows(max(self.AVERAGES))
         self._start, self._start_value = self.START
         self._sample, length = self.SAMPLE
@@ -224,9 +223,9 @@ class Magnetometer:
         if average not in self.AVERAGES:
             choice = ", ".join(str(a) for a in sorted(self.AVERAGES))
             raise ValueError(f"average {average!r} is not one of {choice}")
-        num, den = _ratio(
-            "sample_rate", self._link.sample_rate if sample_rate is None else sample_rate
-        )
+        if sample_rate is None:
+            sample_rate = self._link.sample_rate
+        num, den = _ratio("sample_rate", sample_rate)
         rate_num, rate_den = _ratio("rate_hz", rate_hz)
         # At least 2, for DRDY shows a new measurement by going away in between
         n = max(2, -(-num * rate_den // (den * rate_num)))
