@@ -184,8 +184,8 @@ class Magnetometer:
             except OSError:
                 pass  # of another chip
             who = self._await(identity)
-        if who == right:
-            stuck = self._reset()
+        stuck = who == right and self._reset()
+        if stuck:  # or is it another chip, that showed this by chance?
             who = self._await(identity)
         if who != right:
             raise self.error_class(
