@@ -83,6 +83,16 @@ def _gains(kind):
     return names or kind.__init__.__code__.co_varnames[: kind.__init__.__code__.co_argcount]
 
 
+@pytest.mark.parametrize("lsb", [0, 63, 32768, 2048.0])
+@pytest.mark.parametrize("name", SOFTWARE)
+def test_an_accelerometer_scale_that_cannot_be_is_refused(name, lsb):
+    class Other(Scales):
+        accel_lsb_per_g = lsb
+
+    with pytest.raises(ValueError, match=r"accel_lsb_per_g is .*, expected an int, 64\.\.32767"):
+        filters.make(name, 200, Other, {})
+
+
 @pytest.mark.parametrize("known_s", [0, 1, 2.5, 3600])
 def test_how_well_a_bias_is_known_changes_nothing_yet(made, known_s):
     made.set_bias(100, -200, 300)
@@ -103,10 +113,11 @@ def test_a_bias_that_the_numbers_cannot_hold_is_refused(made, b):
         made.set_bias(0, b, 0)
 
 
-def test_a_first_sample_without_gravity_is_none(made):
+@pytest.mark.parametrize("z", [0, 1, 255, -255])  # 1/16 g
+def test_a_first_sample_without_gravity_is_none(made, z):
     made.set_quaternion(1, 2, 3, 4)
     short = array("h", AT_REST)
-    short[2] = 255  # 1/16 g
+    short[2] = z
     assert made.seed(short) is False
     assert made.quaternion_floats() == (1, 0, 0, 0)
 

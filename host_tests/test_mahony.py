@@ -138,14 +138,6 @@ def test_seed_levels_at_once_at_any_attitude(x, y, z):
     assert mahony_float.angle_between(before, filter.quaternion_floats()) < 1e-4
 
 
-@pytest.mark.parametrize("z", [0, 1, -255])
-def test_seed_says_so_when_there_is_no_gravity(z):
-    filter = Mahony6(200, SCALE, 4096)
-    filter.set_quaternion(1, 2, 3, 4)
-    assert filter.seed(counts(0, 0, z)) is False
-    assert filter.quaternion_floats() == (1, 0, 0, 0)
-
-
 def test_set_quaternion_normalises():
     filter = Mahony6(200, SCALE, 4096)
     out = array("i", [0] * 4)

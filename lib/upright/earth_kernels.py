@@ -254,8 +254,7 @@ class EarthFilter(Attitude):
     def __init__(self, rate, gyro_scale, accel_lsb_per_g, words, parameters):
         """Take rate, scales and parameters, or raise; then set_up(p, parameters), start level and know no bias.
 
-        p: the parameters in millionths, those that were not given by default.
-
+        p: all parameters in millionths.
         """
         Attitude.__init__(self, rate, gyro_scale, accel_lsb_per_g, words)
         s = self.state
@@ -286,7 +285,7 @@ class EarthFilter(Attitude):
         s[_PHASE] = 1  # the first block is a whole one for the gyro's mean
         # |W| < 1 rad with every axis at full scale against a bias of 8192 counts and the largest corrections
         bias_most, room = self.bounds(p)
-        counts_most = 32768 + 8192 + self.counts(bias_most, 1)
+        counts_most = 32768 + 8192 + self.gyro_counts(bias_most, 1)
         turn_most = (gain * counts_most >> 15) * 17321 // 10000
         if turn_most + room > _STEP_MAX or gain < 1 << 17:
             raise ValueError(
@@ -299,12 +298,12 @@ class EarthFilter(Attitude):
                     per,
                 )
             )
-        if self.counts(p["rest_gyro_dps"], 1) > 2000:
+        if self.gyro_counts(p["rest_gyro_dps"], 1) > 2000:
             raise ValueError("gyro_scale is %d/%d, too fine for rest_gyro_dps" % self.gyro_scale)
         t = den << shift
         s[_REST_K] = fixmath.ratio(t << 17, num + 4 * t)  # T / (1/4 + T), Q15
         s[_REST_AFTER] = max(1, self.blocks(p["rest_after"]))
-        s[_REST_GYRO] = self.counts(p["rest_gyro_dps"], 8) ** 2
+        s[_REST_GYRO] = self.gyro_counts(p["rest_gyro_dps"], 8) ** 2
         s[_REST_ACCEL] = fixmath.ratio(p["rest_accel_g"] * 8 * accel_lsb_per_g, MILLION) ** 2
         self.set_up(p, parameters)
         num, den = self.bias_unit
@@ -317,7 +316,7 @@ class EarthFilter(Attitude):
         num, den = self.rate
         return fixmath.ratio(millionths * num << bits, MILLION * den << self.state[_BLOCK])
 
-    def counts(self, millionths, units):
+    def gyro_counts(self, millionths, units):
         """A rate in 1e-6 deg/s as gyro counts, times units."""
         scale, per = self.gyro_scale
         return fixmath.ratio(millionths * units * scale, MILLION * per)

@@ -197,7 +197,7 @@ class Inertial9(EarthFilter):
     def set_up(self, p, given):
         s, lsb = self.state, self.accel_lsb_per_g
         s[_LITE] = int(self.LITE)
-        whole, counts, ratio = self.blocks, self.counts, fixmath.ratio
+        whole, counts, ratio = self.blocks, self.gyro_counts, fixmath.ratio
         num, den = self.rate
         scale, per = self.gyro_scale
         gain = (s[_G] << 15) + s[_GR]

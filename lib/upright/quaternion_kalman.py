@@ -279,7 +279,7 @@ class QuaternionKalman9(EarthFilter):
     def set_up(self, p, given):
         # every variance stays below 2**30
         s, lsb = self.state, self.accel_lsb_per_g
-        blocks, counts, ratio = self.blocks, self.counts, fixmath.ratio
+        blocks, counts, ratio = self.blocks, self.gyro_counts, fixmath.ratio
         num, den = self.rate
         scale, per = self.gyro_scale
         shift = s[_BLOCK]

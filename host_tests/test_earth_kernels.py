@@ -1,0 +1,206 @@
+"""What both filters that average in the earth frame do: their shared kernels, start and recovery, what they refuse."""
+
+import math
+import random
+from array import array
+
+import motions
+import numpy as np
+import pytest
+from histories import ONE, SCALE, SCALES
+from test_inertial import PACES, all_axes, as_start, errors, pushes, scene
+from upright import earth_kernels
+from upright.inertial import Inertial9
+from upright.quaternion_kalman import QuaternionKalman9
+from upright_host import words
+from upright_host.simulate import best_runtime as quickest
+
+AT = words.places("inertial")
+STILL = 1  # of DECIDED, in both
+KINDS = {"inertial": Inertial9, "quaternion-kalman": QuaternionKalman9}
+LARGEST_BIAS = {"inertial": {"bias_limit_dps": 25}, "quaternion-kalman": {"bias_start": 10}}
+
+
+@pytest.fixture(params=KINDS)
+def kind(request):
+    return request.param
+
+
+@pytest.fixture
+def history(filter_history, kind):
+    """history(rendered, axes, **options) -> History of all its rows, with `decided`."""
+
+    def run(rendered, axes=9, **options):
+        options["words"] = [words.places(kind.replace("-", "_")).DECIDED]
+        got = filter_history(quickest(), rendered, f"{kind}{axes}", **options)
+        got.decided = got.words[:, 0]
+        return got
+
+    return run
+
+
+# -- the kernels
+def new_state():
+    s = array("i", [0] * AT.size)
+    s[AT.PROBE] = -1
+    return s
+
+
+def test_the_rows_and_the_force_are_those_of_the_attitude():
+    rng = np.random.default_rng(1)
+    for _ in range(200):
+        q = rng.standard_normal(4)
+        q /= np.linalg.norm(q)
+        s = new_state()
+        s[AT.NINE] = 1
+        s[AT.Q : AT.Q + 4] = array("i", [round(v * ONE) for v in q])
+        accel, mag = rng.integers(-32766, 32767, 3), rng.integers(-32766, 32767, 3)
+        counts = array("h", [*accel.tolist(), 0, 0, 0, *mag.tolist(), 0, 3])
+        earth_kernels.to_earth(s, counts)
+        rows = motions._matrix(q[None])[0]
+        assert np.abs(np.array(s[AT.R : AT.R + 9]).reshape(3, 3) / 32768 - rows).max() < 1e-4
+        assert np.abs(np.array(s[AT.FORCE : AT.FORCE + 3]) / 32768 - rows @ accel).max() < 6
+        assert s[AT.MN] == 1
+        assert np.abs(np.array(s[AT.MS : AT.MS + 3]) / 512 - rows @ mag).max() < 6
+
+
+def test_the_heading_is_the_arc_tangent_of_the_mean_field():
+    rng = random.Random(2)
+    for _ in range(300):
+        n = rng.randint(1, 32)
+        field = [rng.randint(-20000, 20000) for _ in range(3)]
+        s = new_state()
+        s[AT.MS : AT.MN + 1] = array("i", [v * n << 9 for v in field] + [n])
+        s[AT.SINCE] = 3
+        earth_kernels.compass(s, AT.MS, round(math.pi * 2**28))
+        north, west, up = field
+        off = s[AT.HEADING] / 2**28 - math.atan2(-west, north)
+        assert abs(math.remainder(off, 2 * math.pi)) < 3e-6 + 1e-4 / max(math.hypot(north, west), 1)
+        across = math.hypot(north, west)
+        assert s[AT.NOW] / 2**13 == pytest.approx(across, rel=1e-4, abs=0.01)
+        assert s[AT.NOW + 1] / 2**13 == up
+        assert (s[AT.J], s[AT.SINCE]) == (4, 0)
+        assert list(s[AT.MS : AT.MN + 1]) == [0] * 4
+    earth_kernels.compass(s, AT.MS, round(math.pi * 2**28))
+    assert (s[AT.J], s[AT.SINCE]) == (0, 1)  # no sample, no heading
+
+
+def test_the_low_passes_take_the_mean_first_and_then_a_quarter_of_a_second():
+    s = new_state()
+    s[AT.REST_K] = 4096
+    low1, low2 = np.zeros(6), np.zeros(6)
+    rng = np.random.default_rng(3)
+    for k in range(1, 40):
+        now = rng.integers(-2000, 2000, 6)
+        s[AT.IN : AT.IN + 6] = array("i", (now << 12).tolist())
+        earth_kernels.low_pass(s, AT.IN + 3)
+        gain = max(1 / k, 1 / 8)
+        low1 += gain * (now - low1)
+        low2 += gain * (low1 - low2)
+        assert np.abs(np.array(s[AT.LOW2 : AT.LOW2 + 6]) / 4096 - low2).max() < 0.5
+        away = np.minimum(np.abs(now - low2), 2048) ** 2
+        expected = [away[:3].sum() * 64, away[3:].sum() * 64]
+        assert list(s[AT.AWAY : AT.AWAY + 2]) == pytest.approx(expected, rel=0.01)
+
+
+# -- start and recovery
+@pytest.mark.parametrize("rate, mag_every", [*PACES, (1000, 10)])
+@pytest.mark.parametrize("degrees", [90, 150, 170])
+def test_a_wrong_start_is_level_within_half_a_second(history, rate, mag_every, degrees):
+    rendered = scene(rate, 4, bias_dps=(0, 0, 0), mag_every=mag_every)
+    for axis in ((1, 0, 0), (0, 1, 0), (-0.5, 0.5, 0.7)):
+        got = history(rendered, start=as_start(axis, degrees))
+        inclination, heading = errors(got.q, rendered)
+        assert inclination[int(0.5 * rate) :].max() < 2, axis
+        assert abs(heading[-1]) < 8, axis
+        assert inclination[0] > 20  # it was wrong
+
+
+@pytest.mark.parametrize("rate, mag_every", PACES)
+def test_a_bias_at_rest_is_found_within_three_seconds(history, rate, mag_every):
+    bias = (5, -5, 5)
+    got = history(scene(rate, 3, bias_dps=bias, mag_every=mag_every))
+    assert np.abs(got.bias_dps[-1] - bias).max() < 0.1
+    assert np.abs(got.bias_dps[rate] - bias).max() > 1  # and after one it was not known
+
+
+@pytest.mark.parametrize("rate, mag_every", PACES)
+@pytest.mark.parametrize("axes", [9, 6])
+def test_a_bias_is_found_while_everything_turns_from_the_first_second(
+    history, kind, rate, mag_every, axes
+):
+    bias = (4, -4, 4)
+    got = history(scene(rate, 60, all_axes, pushes, bias, mag_every=mag_every), axes)
+    off = np.abs(got.bias_dps[-1] - bias).max()
+    assert off < {"inertial": 1, "quaternion-kalman": 0.2}[kind]
+    assert not (got.decided[5 * rate :] & STILL).all()
+
+
+@pytest.mark.parametrize("rate, mag_every", PACES)
+@pytest.mark.parametrize(
+    "kick", [(90, 0, 0), (0, -90, 0), (0, 0, 90), (0, 0, -40), (52, 52, 52)], ids=str
+)
+def test_a_kick_at_rest_is_forgotten(history, rate, mag_every, kick):
+    rendered = scene(rate, 37, kick=(25, kick), mag_every=mag_every)
+    got = history(rendered)
+    inclination, heading = errors(got.q, rendered)
+    at = 25 * rate
+    assert max(inclination[at + 1], abs(heading[at + 1])) > 35  # it was one
+    assert inclination[at + 4 * rate :].max() < 3
+    assert np.abs(heading[at + 10 * rate :]).max() < 5
+    assert np.abs(got.bias_dps[-1] - (1.2, -0.8, 0.6)).max() < 0.1
+
+
+def test_swings_cancel_before_they_count_as_tilt(history):
+    """0.5 g to and fro at 1.5 Hz, no rotation: the classic filter would follow by degrees."""
+
+    def swing(t):
+        return np.outer(np.sin(2 * np.pi * 1.5 * t) * (t > 10), (0.5, 0, 0))
+
+    rendered = scene(200, 30, accel=swing)
+    inclination, _ = errors(history(rendered).q, rendered)
+    assert inclination[10 * 200 :].max() < 1.2
+
+
+def test_a_turntable_from_power_on_is_taken_for_a_bias(history):
+    """The known limit; after a rest it is not: a known bias does not jump."""
+    rendered = scene(200, 20, lambda t: np.outer(t >= 0, (0, 0, 3.0)), bias_dps=(0, 0, 0))
+    assert history(rendered, 6).bias_dps[-1, 2] == pytest.approx(3, abs=0.1)
+    rendered = scene(200, 60, lambda t: np.outer(t > 10, (0, 0, 3.0)), bias_dps=(0, 0, 0))
+    assert history(rendered, 6).bias_dps[-1, 2] == pytest.approx(0, abs=0.1)
+
+
+def test_no_constant_shrinks_with_the_rate(history, kind):
+    """The same 40 s at 90 and at 1000 Hz: the same errors, the same bias, at the same times."""
+    bias = (2, -3, 1)
+    found = {}
+    for rate in (90, 1000):
+        got = history(scene(rate, 40, all_axes, pushes, bias))
+        found[rate] = got.bias_dps[10 * rate :: 10 * rate] - bias
+    apart = np.abs(found[90] - found[1000]).max()
+    assert apart < {"inertial": 0.15, "quaternion-kalman": 0.2}[kind]
+    if kind == "inertial":
+        assert np.abs(found[1000][0]).max() > 0.3  # it was not there yet
+
+
+# -- what is refused
+@pytest.mark.parametrize("rate", [90, 100, (200, 1), (2000, 7), 500, 1000, (1000, 11)])
+@pytest.mark.parametrize("fsr", [250, 500, 1000, 2000])
+def test_every_rate_from_90_to_1000_hz_will_do(kind, rate, fsr):
+    assert KINDS[kind](rate, SCALES[fsr], 2048, **LARGEST_BIAS[kind]).rate[0]
+
+
+@pytest.mark.parametrize("rate", [49, 1440, 8000, 0, -200, (200, 0), 200.5, "200", None])
+def test_a_rate_that_the_numbers_cannot_hold_is_refused(kind, rate):
+    with pytest.raises(ValueError, match=r"rate is .*, expected"):
+        KINDS[kind](rate, SCALES[250], 2048)
+
+
+def test_a_gyro_too_fine_for_the_rest_detector_is_refused(kind):
+    with pytest.raises(ValueError, match="gyro_scale is 1000/1, too fine"):
+        KINDS[kind](200, (1000, 1), 2048, rest_gyro_dps=10)
+
+
+def test_what_it_does_not_know_is_named_with_what_there_is(kind):
+    with pytest.raises(TypeError, match=r"no parameter 'tau'; there are .*rest_after"):
+        KINDS[kind](200, SCALE, 2048, tau=3)
