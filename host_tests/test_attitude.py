@@ -150,7 +150,9 @@ def test_a_field_that_stands_upright_gives_no_heading(made):
     assert made.quaternion_floats() == pytest.approx((1, 0, 0, 0), abs=1e-6)
 
 
-@pytest.mark.parametrize("bad", [(0, 0, 0), (32767, 0, 0), (-32768, 5, 5), (5, 5, -32767)])
+@pytest.mark.parametrize(
+    "bad", [(0, 0, 0), (32767, 0, 0), (-32768, 5, 5), (5, 5, -32767), (5, 5, 32767)]
+)
 def test_a_magnetometer_sample_that_cannot_be_turns_nothing(made, bad):
     row = array("h", AT_REST)
     row[3:6] = array("h", [0, 0, 0])

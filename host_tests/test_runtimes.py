@@ -9,7 +9,8 @@ import sys
 
 import numpy as np
 import pytest
-from upright_host import console, debian, paths, runtimes
+from conftest import require
+from upright_host import console, debian, paths, runtimes, simulate
 
 
 @pytest.fixture
@@ -183,3 +184,14 @@ def test_the_cache_is_where_it_is_told_to_be(monkeypatch, tmp_path):
     monkeypatch.delenv("UPRIGHT_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
     assert paths.cache() == tmp_path / "xdg" / "upright"
+
+
+def test_the_quickest_of_what_is_left_is_taken(fresh):
+    for name in ("unix", "unix32"):
+        left = "unix32" if name == "unix" else "cpython"
+        runtimes.leave_out(name, "for a reason")
+        with pytest.raises(runtimes.Unavailable, match="for a reason"):
+            runtimes.interpreter(name)
+        if left == "unix32":
+            require("unix32")
+        assert simulate.best_runtime() == left

@@ -211,3 +211,12 @@ def test_only_integers_of_the_right_shape_are_written(tmp_path):
     for wrong in ([[1.0, 0, 0, 0]], [[1, 2, 3]], [1, 2, 3, 4]):
         with pytest.raises(ValueError, match="expected integers"):
             scoring.write_csv(tmp_path / "x.csv", wrong, (200, 1))
+
+
+def test_truth_within_the_slack_of_both_ends_counts(hand):
+    """A recording's clock and the output's are not one: half a step before the first row and behind the last."""
+    t = hand.t[10:-10]
+    reach = 3 / 100
+    counted = scoring.score(t, hand.q_true[10:-10], hand.t, hand.q_true, slack=reach + 1e-6)
+    assert counted.samples == len(t) + 6
+    assert scoring.score(t, hand.q_true[10:-10], hand.t, hand.q_true).samples == len(t)

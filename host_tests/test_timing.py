@@ -170,3 +170,15 @@ def test_the_simulated_board_ticks_at_its_rate():
     kernel.advance(1000000)
     assert len(count) == 285
     assert isinstance(count[0], machine.Timer)
+
+
+@pytest.mark.parametrize(("centi_us", "kept"), [(300027, True), (300045, False)])
+def test_a_rate_is_kept_within_a_crystal_s_error_or_refused(port, centi_us, kept):
+    """90 and 150 ppm off the nearest whole microsecond."""
+    port("rp2")
+    rate = (100_000_000, centi_us)
+    if kept:
+        assert timing.make_tick(rate, print).period_us == 3000
+    else:
+        with pytest.raises(ValueError, match="cannot tick at"):
+            timing.make_tick(rate, print)
