@@ -247,11 +247,14 @@ def test_a_pin_follows_its_chip_and_interrupts_on_its_edges(echo):
     kernel.changed()
     kernel.advance(1000)
     assert len(edges) == 2
-    echo.toggles = [2300, 3500]
-    kernel.advance(1000)  # it falls while nobody listens; who comes after hears it rise
+    echo.toggles = [2300]
+    kernel.advance(500)
+    assert pin.value() == 0
+    echo.toggles = [2700, 3500, 3700]
+    kernel.advance(500)  # it rises while nobody listens: no edge for who comes after
     pin.irq(lambda p: edges.append((kernel.now(), p.value())), machine.Pin.IRQ_RISING, hard=True)
     kernel.advance(1000)
-    assert edges[2:] == [(3500, 1)]
+    assert edges[2:] == [(3700, 1)]
 
 
 def test_spi_reaches_the_selected_chip_with_its_clock_and_mode(echo):
