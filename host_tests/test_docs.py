@@ -99,6 +99,21 @@ def test_the_files_that_are_named_exist(page):
             assert (paths.ROOT / named).exists(), f"{page.name} names {named}"
 
 
+@pytest.mark.parametrize("page", ["methods.md", "methods.zh.md"])
+def test_the_functions_that_the_methods_name_are_in_the_files_beside_them(page):
+    paragraphs = re.findall(
+        r"^(?:In the code|代码)[:\uFF1A].*?(?:\n\n|\Z)",
+        (paths.ROOT / "docs" / page).read_text(),
+        re.S | re.M,
+    )
+    assert len(paragraphs) > 12
+    for paragraph in filter(re.compile(r"\.py`").search, paragraphs):
+        files = re.findall(r"`([\w/]+\.py)`", paragraph)
+        text = "".join((paths.ROOT / file).read_text() for file in files)
+        for named in re.findall(r"`(\w+)(?:\(\))?`", paragraph):
+            assert re.search(rf"\b{named}\b", text), f"{named} is not in {files}"
+
+
 def test_every_call_and_every_word_of_the_status_is_on_the_page_of_the_face():
     page = (paths.ROOT / "docs/face.md").read_text()
     machine.wire_i2c(0, MPU6050Chip(StillWorld((0, 0, 4096))))
