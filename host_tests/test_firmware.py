@@ -209,6 +209,19 @@ def test_a_chip_that_resets_itself_is_put_right_in_flight(boot, drive):
 
 
 @pytest.mark.parametrize("drive", ["timer", "data_ready", "fifo"])
+def test_a_chip_that_takes_no_samples_any_more_is_reset_in_flight(boot, drive):
+    result, *_ = boot(
+        seconds=6,
+        board={"DRIVE": drive, "SENSOR_RATE_HZ": 200},
+        faults=[[3 * SECOND, "imu", "jam"]],
+    )
+    healthy(result)
+    assert (result["full_resets"], result["resets"]) == (1, 0)
+    expected = result["steps"] if drive == "timer" else 200 * (result["ended_us"] / SECOND - 1.4)
+    assert result["fresh"] > expected - 300  # at most a second and a half without
+
+
+@pytest.mark.parametrize("drive", ["timer", "data_ready", "fifo"])
 def test_a_sensor_that_is_gone_for_good_is_shown_on_the_display(boot, drive):
     config = {"seconds": 5, "board": {"DRIVE": drive, "SENSOR_RATE_HZ": 200, "PAGE_SECONDS": 0}}
     *_, well = boot(**config)[:3]
@@ -230,7 +243,7 @@ def test_a_stuck_bus_costs_time_not_the_program(boot):
 
 FAULTS = (
     *("missed", "crashes", "step_errors", "errors", "resets", "fifo_overflows", "display_errors"),
-    *("mag_errors", "mag_resets"),
+    *("full_resets", "mag_errors", "mag_resets"),
 )
 
 

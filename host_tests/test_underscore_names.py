@@ -5,8 +5,6 @@ import ast
 import pytest
 from upright_host import paths
 
-NOT_YET = {"ist8310"}
-
 
 def own_names(tree):
     """Underscore names that a module defines: of itself, of its classes, of their objects."""
@@ -45,11 +43,7 @@ def foreign_names(tree):
 
 @pytest.mark.parametrize("path", sorted(paths.PACKAGE.glob("*.py")), ids=lambda path: path.stem)
 def test_a_module_uses_no_underscore_name_of_another(path):
-    found = foreign_names(ast.parse(path.read_text()))
-    if path.stem in NOT_YET:
-        assert found, f"take {path.stem} out of NOT_YET"
-        return
-    assert found == []
+    assert foreign_names(ast.parse(path.read_text())) == []
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ _TRIAL_STEPS = const(16)
 
 # The counters of status() that are sums of things that went wrong
 _FAULTS = (
-    "missed crashes step_errors errors resets fifo_overflows display_errors "
+    "missed crashes step_errors errors resets full_resets fifo_overflows display_errors "
     "magnetometer_errors magnetometer_resets misaligned stalls"
 )
 
@@ -567,6 +567,7 @@ class AHRS:
             "step_error": tick.step_error,
             "errors": sensor.errors,
             "resets": sensor.resets,
+            "full_resets": getattr(sensor, "full_resets", 0),
             "fifo_overflows": sensor.fifo_overflows,
             "display_errors": self.display.errors if self.display else 0,
         }

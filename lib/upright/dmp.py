@@ -172,7 +172,7 @@ class MpuDmp(MpuDmpSetup):
         """
         if self._off:
             self.stale = (self.stale + 1) & _COUNT_MASK
-            return self._monitor.not_fresh()
+            return self.monitor.not_fresh()
         return self._fetch()
 
     def health(self):
@@ -205,7 +205,7 @@ class MpuDmp(MpuDmpSetup):
     @micropython.native
     def _fetch(self):
         fifo = self.fifo
-        monitor = self._monitor
+        monitor = self.monitor
         if monitor.fifo_misaligned:
             fifo.restart()
             self._seen_ms = time.ticks_ms()
@@ -240,10 +240,10 @@ class MpuDmp(MpuDmpSetup):
 
     def _none(self):
         self.stale = (self.stale + 1) & _COUNT_MASK
-        self._monitor.doubt()
+        self.monitor.doubt()
         if time.ticks_diff(time.ticks_ms(), self._seen_ms) > self._silent_ms:
             self._silent = 1
-        return self._monitor.not_fresh()
+        return self.monitor.not_fresh()
 
     def _partial(self, fraction):
         """Part of a packet is left: one that is being written, or the first has lost its beginning. Wait for the next
@@ -254,14 +254,14 @@ class MpuDmp(MpuDmpSetup):
             self._fractions = 0
         self._fractions += 1
         if self._fractions < _SAME_FRACTION:
-            return self._monitor.not_fresh()
+            return self.monitor.not_fresh()
         self._fractions = 0
         return self._misaligned()
 
     def _misaligned(self):
         self.misaligned = (self.misaligned + 1) & _COUNT_MASK
-        self._monitor.fifo_misaligned = 1  # the next call restarts the FIFO
-        return self._monitor.not_fresh()
+        self.monitor.fifo_misaligned = 1  # the next call restarts the FIFO
+        return self.monitor.not_fresh()
 
     # -- as a filter
 
@@ -291,40 +291,6 @@ class MpuDmp(MpuDmpSetup):
             out[i] = 0
 
     bias_mdps = bias
-
-    # -- what the driver knows
-
-    @property
-    def chip(self):
-        return self._imu.chip
-
-    @property
-    def who_am_i(self):
-        return self._imu.who_am_i
-
-    @property
-    def errors(self):
-        return self._imu.errors
-
-    @property
-    def resets(self):
-        return self._imu.resets
-
-    @property
-    def fifo_overflows(self):
-        return self.fifo.overflows
-
-    @property
-    def fifo_resets(self):
-        return self.fifo.resets
-
-    @property
-    def fifo_lost(self):
-        return self.fifo.lost
-
-    @property
-    def fifo_level(self):
-        return self.fifo.level
 
     # floats, for programs
     accel = Mpu.accel

@@ -11,7 +11,7 @@ from micropython import const
 from upright import fixmath
 from upright.attitude import Attitude
 from upright.dmp_image import DIVIDER, KNOWN, DmpImage, MpuDmpError
-from upright.mpu_fifo import Fifo
+from upright.mpu_fifo import Counters, Fifo
 
 # Registers, by their names in InvenSense's motion driver 6.12 (inv_mpu.c); not in RM-MPU-6000A
 _BANK_SEL = const(0x6D)  # MEM_START_ADDR 0x6E follows: one write of two bytes sets both
@@ -44,7 +44,7 @@ _T = const(14)  # 4 x 4, Q15: from the packet's quaternion to the body's
 _STATE_WORDS = const(30)
 
 
-class MpuDmpSetup(Attitude):
+class MpuDmpSetup(Attitude, Counters):
     """What may wait, allocate and raise; dmp.MpuDmp adds what the tick calls."""
 
     def __init__(
@@ -59,7 +59,8 @@ class MpuDmpSetup(Attitude):
     ):
         self._divider = _divider(rate_hz)
         self._imu = imu
-        self._monitor = imu.monitor
+        self.monitor = imu.monitor
+        self.chip = self.who_am_i = None
         self.rate = self.sample_rate = (rate_hz, 1)
         self.gyro_scale = (82, 5)
         self.accel_range_g = 2
@@ -129,6 +130,7 @@ class MpuDmpSetup(Attitude):
     def _start(self):
         imu = self._imu
         imu.configure(accel_range_g=2, gyro_range_dps=2000, sample_rate_hz=_BASE_HZ)
+        self.chip, self.who_am_i = imu.chip, imu.who_am_i
         two = bytearray(2)
         imu.registers.read_registers(
             _TEMP_OUT_H, two

@@ -10,7 +10,7 @@ import micropython
 from micropython import const
 
 from upright import mpu_parts
-from upright.mpu_fifo import Fifo, unpack
+from upright.mpu_fifo import Counters, Fifo, unpack
 from upright.mpu_monitor import Monitor
 from upright.mpu_table import RegisterTable
 
@@ -52,7 +52,7 @@ _RESET = const(4)  # state of the monitor
 _COUNT_MASK = const(0x3FFFFFFF)
 
 
-class Mpu:
+class Mpu(Counters):
     """A chip of the family behind a port, which says how it is connected:
 
         registers    I2CRegisters or SPIRegisters
@@ -107,6 +107,10 @@ class Mpu:
         self.health = self.monitor.health
         self.fifo_poll = self.fifo.poll
         self.fifo_next = self.fifo.next
+        # For set-up, also of what works through this chip; raise error_class, naming the register. health() does not
+        # watch what write_register() writes.
+        self.read_register = registers.read_register
+        self.write_register = registers.write_register
 
     # The tick: nothing here allocates, waits, raises or uses a float. Native: half the time of bytecode.
 
@@ -389,14 +393,6 @@ class Mpu:
 
     # Set-up for what works through this chip: a device on its auxiliary bus
 
-    def read_register(self, register):
-        """One register; raises error_class, naming it, when the bus fails."""
-        return self.registers.read_register(register)
-
-    def write_register(self, register, value):
-        """Write one register that health() is not to watch; raises error_class, naming it."""
-        self.registers.write_register(register, value)
-
     def set_rows(self, rows):
         """Configure registers and have health() watch them and a repair write them back.
 
@@ -450,6 +446,11 @@ class Mpu:
         self._hand_on_to(device)
         if on:
             self.fifo_enable(min(fifo.batch, fifo.size // fifo.packet))
+
+    @property
+    def repair_calls(self):
+        """Calls of health() that a repair takes at most, from the first stale sample on, if the bus works."""
+        return self.monitor.repair_calls()
 
     # Its parts
 
@@ -534,42 +535,3 @@ class Mpu:
     def _need_configured(self):
         if not self._configured:
             raise self.error_class("configure() first")
-
-    # What the parts count
-
-    @property
-    def errors(self):
-        return self.monitor.errors
-
-    @property
-    def resets(self):
-        return self.monitor.resets
-
-    @property
-    def full_resets(self):
-        return self.monitor.full_resets
-
-    @property
-    def repair_calls(self):
-        """Calls of health() that a repair takes at most, from the first stale sample on, if the bus works."""
-        return self.monitor.repair_calls()
-
-    @property
-    def fifo_size(self):
-        return self.fifo.size
-
-    @property
-    def fifo_level(self):
-        return self.fifo.level
-
-    @property
-    def fifo_overflows(self):
-        return self.fifo.overflows
-
-    @property
-    def fifo_resets(self):
-        return self.fifo.resets
-
-    @property
-    def fifo_lost(self):
-        return self.fifo.lost

@@ -246,3 +246,39 @@ class Fifo:
         self._monitor.fifo_misaligned = 0
         self.resets = (self.resets + 1) & _COUNT_MASK
         return True
+
+
+class Counters:
+    """What the monitor and the FIFO of an object count, under the names that programs use."""
+
+    @property
+    def errors(self):
+        return self.monitor.errors
+
+    @property
+    def resets(self):
+        return self.monitor.resets
+
+    @property
+    def full_resets(self):
+        return self.monitor.full_resets
+
+    @property
+    def fifo_size(self):
+        return self.fifo.size
+
+    @property
+    def fifo_level(self):
+        return self.fifo.level
+
+    @property
+    def fifo_overflows(self):
+        return self.fifo.overflows
+
+    @property
+    def fifo_resets(self):
+        return self.fifo.resets
+
+    @property
+    def fifo_lost(self):
+        return self.fifo.lost

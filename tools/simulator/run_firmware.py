@@ -194,7 +194,16 @@ def finish(imu, recorder, parts):
     if imu is not None and imu.tick is not None:
         status = imu.status()
         result["started"] = True
-        for name in ("steps", "fresh", "missed", "crashes", "errors", "resets", "fifo_overflows"):
+        for name in (
+            "steps",
+            "fresh",
+            "missed",
+            "crashes",
+            "errors",
+            "resets",
+            "full_resets",
+            "fifo_overflows",
+        ):
             result[name] = status[name]
         result["error"] = repr(status["error"]) if status["error"] else None
         result["step_errors"] = status["step_errors"]
