@@ -222,12 +222,14 @@ class AuxiliaryBus:
         while True:
             late = time.ticks_diff(time.ticks_us(), start) > most
             outcome = self.transact(address, register, data)
-            self._left = _CALLS
-            if outcome == AUX_BUSY and late:
-                self._left = 0
-                outcome = self.transact(address, register, data)
             if outcome != AUX_BUSY:
                 break
+            if (
+                self._step != _WAIT
+            ):  # not on its way yet: where the IMU does not answer, it has 16 calls
+                start = time.ticks_us()
+                continue
+            self._left = 0 if late else _CALLS  # 0: the next call gives it up
             time.sleep_us(50)
         lost = self.faults & _LOST_ARB
         self.faults |= earlier
