@@ -42,12 +42,17 @@ MOVED = {
 
 
 def board_files(
-    board: str, facts: device.Facts, source: bool = False, own: str = "", everything: bool = False
+    board: str,
+    facts: device.Facts,
+    source: bool = False,
+    own: str = "",
+    everything: bool = False,
+    small: bool = False,
 ) -> dict[str, bytes]:
     """Every file of an installation: {name on the board: content}. Raises device.DeviceError.
 
     own: the text of programs of the user's, which stay on the board; what they need is installed as well.
-    everything: all modules, needed or not.
+    everything: all modules, needed or not. small: packed, for a file system that is too small otherwise.
     """
     files = {"board.py": (paths.BOARDS / paths.known_board(board) / "board.py").read_bytes()}
     for path in sorted(paths.FIRMWARE.glob("*.py")):
@@ -61,10 +66,10 @@ def board_files(
         if not wanted and not everything:
             continue
         if compiler:
-            files[f"{name}.mpy"] = compile_module(compiler, facts.architecture, path)
+            files[f"{name}.mpy"] = compile_module(compiler, facts.architecture, path, small)
         else:
             files[f"{name}.py"] = path.read_bytes()
-    return files
+    return packed(files) if small else files
 
 
 def packed(files: dict[str, bytes]) -> dict[str, bytes]:
@@ -94,7 +99,7 @@ def sizes() -> list[tuple[str, int, int, int]]:
     for board, architecture in ARCHITECTURES.items():
         facts = device.Facts("", "", (1, 27, 0), 6, 3, architecture, True, True, True, True, 0)
         files = board_files(board, facts)
-        small = packed(files)
+        small = board_files(board, facts, small=True)
         rows.append(
             (board, len(files), sum(map(len, files.values())), sum(map(len, small.values())))
         )
@@ -172,16 +177,18 @@ def find_compiler(facts: device.Facts) -> Path:
     )
 
 
-def compile_module(compiler: Path, architecture: str, path: Path) -> bytes:
-    """-> the .mpy of a module: with line numbers, which cost 3 % and make a traceback worth having."""
-    return _compile(compiler, architecture, path.read_text(), path.name)
+def compile_module(compiler: Path, architecture: str, path: Path, small: bool = False) -> bytes:
+    """-> the .mpy of a module: with line numbers, which cost 3 % and make a traceback worth having; small: without."""
+    return _compile(compiler, architecture, path.read_text(), path.name, "-O3" if small else "-O2")
 
 
-def _compile(compiler: Path, architecture: str, text: str, name: str = "a.py") -> bytes:
+def _compile(
+    compiler: Path, architecture: str, text: str, name: str = "a.py", level: str = "-O2"
+) -> bytes:
     with tempfile.TemporaryDirectory() as here:
         source, out = Path(here) / "in.py", Path(here) / "out.mpy"
         source.write_text(text)
-        command = [compiler, f"-march={architecture}", "-O2", "-s", name, "-o", out, source]
+        command = [compiler, f"-march={architecture}", level, "-s", name, "-o", out, source]
         done = subprocess.run(command, capture_output=True, text=True)
         if done.returncode:
             raise device.DeviceError(f"{name} does not compile: {done.stderr.strip()}")

@@ -266,13 +266,15 @@ class Work:
         def room(sizes):
             return sum(-(-size // block) * block for size in sizes)
 
-        sizes = [*map(len, files.values()), *(plan.found[name][1] for name in plan.backup)]
-        need = room([*sizes, len(_in_front(f"finish({self.order!r}, {remove!r})"))])
-        need += _room_of_folders(plan, files, block)
+        backup = [plan.found[name][1] for name in plan.backup]
+        need = room([*map(len, files.values()), *backup]) + _room_of_folders(plan, files, block)
         freed = room(plan.found.get(name, (None, 0))[1] for name in {*files, *remove, SELF})
-        self.beside = need + SPARE <= free
+        # meanwhile: the file that puts the others in place, and the folder of the staged ones
+        for_now = room([len(_in_front(f"finish({self.order!r}, {remove!r})")), 32 * len(files)])
+        for_now += 2 * block
+        self.beside = need + for_now <= free
         self.shortage = None
-        if need + SPARE > free + freed:
+        if need + SPARE > free + freed or need + for_now > free + freed:
             self.shortage = (
                 f"{need} bytes and {SPARE} to spare do not fit: {free} are free on the board and {freed} "
                 "would become so"
@@ -318,9 +320,9 @@ def execute(transport, plan: Plan, on_progress=None) -> bool:
 
 def _room_of_folders(plan: Plan, files, block: int) -> int:
     """Bytes that folders take, at most. A new one is a block on FAT, two on littlefs, whose blocks are larger; a new
-    file's entry, with a long name, is 96 bytes on FAT, in the folder of the staged ones 32."""
-    new = 1 + sum(plan.found.get(name, (None,))[0] is None for name in _folders(files))
-    entries = sum(32 + 96 * (plan.found.get(name, (None,))[0] is None) for name in files)
+    file's entry, with a long name, is 96 bytes on FAT."""
+    new = sum(plan.found.get(name, (None,))[0] is None for name in _folders(files))
+    entries = sum(96 * (plan.found.get(name, (None,))[0] is None) for name in files)
     return new * block * (1 if block < 4096 else 2) + -(-entries // block) * block
 
 
@@ -434,7 +436,8 @@ def run(transport, board: str, source: bool, force: bool, everything: bool = Fal
     steps = plan(transport, files, force)
     if found.deflate and not source and Work(transport, steps).shortage:
         say("packed, as there is no room for the modules as they are")
-        steps = plan(transport, contents.packed(files), force)
+        files = contents.board_files(board, found, False, _own(transport), everything, small=True)
+        steps = plan(transport, files, force)
     for name, why in steps.kept:
         can = " (--force replaces it, and keeps a copy as NAME.bak)" if name in KEPT else ""
         say(f"{name}: {why}: kept as it is{can}")
