@@ -140,7 +140,7 @@ def _wrapped(words: list[str]) -> list[str]:
     """Words in lines that fit into a box."""
     lines = []
     for word in words:
-        if lines and len(lines[-1]) + len(word) < 33:
+        if lines and len(lines[-1]) + len(word) < 30:
             lines[-1] += f" {word}"
         else:
             lines.append(word)
