@@ -526,3 +526,22 @@ def test_the_settings_of_every_board_can_be_had(folder):
     imu = ahrs.from_board(board)
     imu.settings.check(6 if not hasattr(board, "magnetometer") else 9)
     assert imu.board == board.NAME
+
+
+# ------------------------------------------------------------------------------- every runtime
+
+
+def test_every_runtime_says_the_same(micropython_runtime, portable):
+    """Integers to the last bit, floats as far as those of a board go; the tick's heap is locked meanwhile."""
+    ours = portable("cpython", "ahrs_story.py").splitlines()
+    theirs = portable(micropython_runtime, "ahrs_story.py").splitlines()
+    assert len(theirs) == len(ours) == 5 * 8 + 2
+    for line, wanted in zip(theirs, ours, strict=True):
+        words, expected = line.split(), wanted.split()
+        if words[1] in ("words", "tick") or words[0] in ("status", "waited"):
+            assert words == expected
+        else:
+            assert words[:2] == expected[:2]
+            numbers = [float(word) for word in words[2:]]
+            assert numbers == pytest.approx([float(word) for word in expected[2:]], abs=2e-3)
+    assert ours[-2].split()[3:] == ["0", "0"]

@@ -3,6 +3,7 @@
 import io
 import itertools
 import json
+import math
 import random
 from array import array
 from fractions import Fraction
@@ -686,3 +687,89 @@ def test_apply_allocates_nothing(micropython_runtime, portable):
 def test_an_allocation_in_apply_would_be_caught(micropython_runtime, portable):
     said = portable(micropython_runtime, "calibration_steps.py", "alloc", "float")
     assert said.startswith("refused 1 grown ") and not said.endswith(" 0\n")
+
+
+# The trim of a tilted mounting
+
+
+def up_ppm(roll, pitch):
+    r, p = math.radians(roll), math.radians(pitch)
+    up = (-math.sin(p), math.sin(r) * math.cos(p), math.cos(r) * math.cos(p))
+    return [round(1e6 * u) for u in up]
+
+
+def trimmed(roll, pitch, axes=("x", "y", "z"), **fields):
+    cal = Calibration(axes, axes, 4096, (82, 5))
+    if fields:
+        cal.set(fields)
+    cal.set_level(up_ppm(roll, pitch))
+    return cal
+
+
+@pytest.mark.parametrize("axes", [("x", "y", "z"), ("y", "-x", "z")])
+def test_a_trim_turns_all_three_sensors_alike(axes):
+    """What lay along the trim's up is along z; the angles between vectors, and their lengths, stay."""
+    cal = trimmed(20, -12, axes)
+    body = [u * 4096 / 1e6 for u in up_ppm(20, -12)]
+    chip = [0.0] * 3
+    for value, axis in zip(body, axes, strict=True):
+        chip["xyz".index(axis[-1])] = -value if axis[0] == "-" else value
+    up = [round(c) for c in chip]
+    for other in ((4000, 0, 0), (0, -4000, 100), (1000, 2000, 3000)):
+        cal.apply(array("h", [*up, *other, *up, 7, 3]))
+        accel, gyro, mag = cal.counts[0:3], cal.counts[3:6], cal.counts[6:9]
+        assert list(accel) == list(mag) == pytest.approx([0, 0, 4096], abs=2)
+        dot = sum(a * b for a, b in zip(accel, gyro, strict=True))
+        was = sum(a * b for a, b in zip(up, other, strict=True))
+        assert dot / 4096 == pytest.approx(was / 4096, abs=4)
+        assert math.hypot(*gyro) == pytest.approx(math.hypot(*other), abs=2)
+        assert (cal.counts[9], cal.counts[10]) == (7, 3)
+
+
+def test_a_trim_keeps_what_is_not_fresh_and_saturates():
+    cal = trimmed(30, 30)
+    cal.apply(array("h", [100, 200, 300, 400, 500, 600, 700, 800, 900, 1, 3]))
+    before = list(cal.counts)
+    cal.apply(array("h", [1, 1, 1, 1, 1, 1, 1, 1, 1, 5, 0]))
+    assert list(cal.counts[:9]) == before[:9]
+    cal.apply(array("h", [-32768] * 9 + [0, 3]))
+    assert min(cal.counts[:9]) == -32768
+    cal.apply(array("h", [32767] * 9 + [0, 3]))
+    assert max(cal.counts[:9]) == 32767
+
+
+def test_the_bias_of_a_trimmed_body_is_stored_in_the_chips_frame(tmp_path):
+    path = str(tmp_path / "c.json")
+    cal = trimmed(20, -12, ("y", "-x", "z"), gyro_bias_udps=[1000000, -2000000, 3000000])
+    body = cal.gyro_bias()
+    assert math.hypot(*body) == pytest.approx(math.hypot(1, 2, 3) * 256 * 16.4, abs=2)
+    cal.save_gyro_bias(path, *body)
+    assert calibration.read(path)["gyro_bias_udps"] == pytest.approx(
+        [1000000, -2000000, 3000000], abs=300
+    )
+
+
+def test_a_trim_is_in_a_file_only_where_there_is_one(tmp_path):
+    path = str(tmp_path / "c.json")
+    calibration.write(path, calibration.blank())
+    assert "up_ppm" not in calibration.read(path)
+    cal = trimmed(20, -12)
+    cal.save_level(path)
+    again = Calibration(accel_lsb_per_g=4096)
+    again.load(path)
+    assert again.fields["up_ppm"] == up_ppm(20, -12)
+    assert not again.identity
+
+
+@pytest.mark.parametrize(
+    "up", [[0, 0, 500000], [900000, 0, 435889], [0, 0, -1000000], [0, 0], [0.0, 0.0, 1e6]]
+)
+def test_what_is_no_trim_is_refused(up):
+    with pytest.raises(CalibrationError, match="up_ppm"):
+        Calibration().set_level(up)
+
+
+def test_a_trim_that_would_leave_32_bits_with_its_matrix_is_refused():
+    matrix = {"offset_ug": [0, 0, 0], "matrix_ppm": [1900000, 0, 0, 0, 10**6, 0, 0, 0, 10**6]}
+    with pytest.raises(CalibrationError, match=r"less tilt with this accel\.matrix_ppm"):
+        trimmed(30, 30, accel=matrix)

@@ -208,6 +208,10 @@ def test_nothing_leaves_32_bits_in_the_kernels_at_their_own_limits(checked):
         fixmath.euler(s[1:5], out, ("zyx", "zxy")[i & 1])
         fixmath.turn(s)
         assert abs(math.hypot(*s[1:5]) / ONE - 1) < 1e-4
+        factor = fixmath.scale(0, 1 + rng.randrange(1 << rng.randrange(1, 30)), 1 << 30)
+        words = [rng.choice((-(1 << 30), (1 << 30) - 1, 32767, rng.randint(-9, 9))) for _ in "xyz"]
+        fixmath.add_scaled(array("i", words), out, factor)
+        out[0] = out[1] = out[2] = rng.choice((-1, 1)) << 21
 
 
 def test_every_operation_of_every_viper_function_was_exercised(checked):
@@ -221,6 +225,7 @@ def test_every_operation_of_every_viper_function_was_exercised(checked):
         "fixmath.north",
         "fixmath.turn",
         "fixmath._euler",
+        "fixmath.add_scaled",
         "mahony.update",
     }
 
