@@ -251,8 +251,8 @@ def test_the_guard_looks_at_a_chip_that_has_fallen_silent(tick, imu):
 
 
 def test_the_whole_tick_allocates_nothing(micropython_runtime, portable):
-    """Ten thousand of each drive with driver, filter and display, and of nine axes on SPI with the calibration; the
-    script's own twin shows that it would tell."""
+    """Ten thousand of each drive with driver, filter and display, and of nine axes on SPI with calibration, trim and a
+    control loop; the script's own twin shows that it would tell."""
     lines = portable(micropython_runtime, "tick_alloc.py").splitlines()
     assert [line.split()[1] for line in lines[:4]] == ["ok"] * 4
     assert lines[4].endswith("found")

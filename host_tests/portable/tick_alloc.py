@@ -4,6 +4,7 @@
 
 import gc
 import sys
+from array import array
 
 import micropython
 import utime
@@ -130,6 +131,18 @@ def build(kind):
     return bus, imu, display, ticks.Tick(imu, filter, 1000, display, 32)
 
 
+out = array("i", [0] * ticks.SNAPSHOT_WORDS)
+readings = []
+
+
+def control(_):
+    """All that a control loop may read in the tick."""
+    tick = readings[0]
+    tick.snapshot(out)
+    tick.angles_into(out)
+    tick.rates_into(out)
+
+
 def build_nine():
     bus = Spi()
     imu = MPU6500(bus, no_select)
@@ -142,7 +155,9 @@ def build_nine():
     )
     display = SSD1306(Bus())
     display.begin()
-    tick = ticks.Tick(imu, filter, 1000, display, 32, calibration=calibration)
+    calibration.set_level((100000, -200000, 974679))
+    tick = ticks.Tick(imu, filter, 1000, display, 32, calibration=calibration, on_step=control)
+    readings.append(tick)
     return bus, imu, display, tick, mag
 
 
@@ -180,7 +195,7 @@ def check(drive, nine=False):
     bus.watching = True
     run(callback, display, 40)
     gc.enable()
-    crashes = tick.crashes + refused
+    crashes = tick.crashes + tick.step_errors + refused
     steps = 0 if drive == "on_guard" else TICKS  # the guard makes none
     ok = not crashes and not grown and not bus.peak and tick.steps >= steps
     if nine:
