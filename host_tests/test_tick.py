@@ -5,7 +5,7 @@ from array import array
 
 import kernel
 import pytest
-from upright.tick import FOLLOW_CHIP, SNAPSHOT_WORDS, TURNS, Tick
+from upright.tick import PHASE_GAIN_SHIFT_CHIP, SNAPSHOT_WORDS, TURNS, Tick
 
 PERIOD = 5000
 
@@ -163,7 +163,7 @@ def test_a_tick_always_a_little_too_long_is_noticed(tick, filter):
 
 def test_a_chip_clock_that_is_off_by_two_percent_is_no_missed_tick(imu, filter):
     for period in (4900, 5100):
-        tick = Tick(imu, filter, PERIOD, follow=FOLLOW_CHIP)
+        tick = Tick(imu, filter, PERIOD, phase_gain_shift=PHASE_GAIN_SHIFT_CHIP)
         start = kernel.now()
         ticks_at(tick, range(start, start + 1000 * period, period))
         assert (tick.missed, tick.steps) == (0, 1000)

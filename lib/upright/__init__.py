@@ -4,15 +4,15 @@
 #     imu = upright.start()
 #     roll, pitch, yaw = imu.angles()
 #
-# Each function imports what it needs when it is called: a program that wants one module alone pays for that alone.
+# Each function imports what it needs when it is called, so a program that uses one module loads only that one.
 
 __version__ = "0.1.0"
 
 
 def start(**settings):
-    """Start with the sensors and settings of board.py -> AHRS (upright/ahrs.py). A start before this one is stopped.
+    """Start with the sensors and settings of board.py -> AHRS (upright/ahrs.py). A running AHRS is stopped first.
 
-    settings: those of AHRS, in place of the board's: start(rate=100, filter="mahony6", on_step=control).
+    settings: those of AHRS; they replace the board's: start(rate=100, filter="mahony6", on_step=control).
     """
     stop()
     return from_board(**settings).start()
@@ -35,14 +35,14 @@ def from_board(**settings):
 
 
 def AHRS(sensor, rate=200, **options):
-    """An AHRS of a driver object of one's own, not started yet: see upright/ahrs.py for its options."""
+    """An AHRS of your own driver object, not started yet; upright/ahrs.py has its options."""
     from upright import ahrs
 
     return ahrs.AHRS(sensor, rate, **options)
 
 
 def stop():
-    """Stop every AHRS that runs: afterwards nothing but the program itself uses a bus."""
+    """Stop every running AHRS. After that only the program uses a bus."""
     import sys
 
     ahrs = sys.modules.get("upright.ahrs")  # nothing runs where nobody has imported it

@@ -16,14 +16,14 @@ from upright.bias import Bias
 from upright.reading import Reading
 from upright.settings import DEFAULTS, FIFO_BATCH, Settings, of_board
 
-_RATE_MS = const(1000)  # between two looks at the rate, the bias, the DMP
-_LOST_MS = const(300)  # without a fresh sample the attitude is only carried on
-_HEADING_MS = const(300)  # the first magnetometer sample is waited for as long
+_RATE_MS = const(1000)  # between two checks of the rate, the bias, the DMP
+_LOST_MS = const(300)  # so long without a fresh sample: the sensor is lost
+_HEADING_MS = const(300)  # start() waits so long for the first magnetometer sample
 _GUARD_HZ = const(50)
-_STILL_DPS = const(3)  # while level() is asked for
+_STILL_DPS = const(3)  # at most, for level()
 _TRIAL_STEPS = const(16)
 
-# The counters of status() that are sums of things that went wrong
+# The counters of status() that add up to its `faults`
 _FAULTS = (
     "missed crashes step_errors errors resets full_resets fifo_overflows display_errors "
     "magnetometer_errors magnetometer_resets misaligned stalls"
@@ -33,7 +33,7 @@ running = []  # every AHRS whose tick runs
 
 
 def stop():
-    """Stop every AHRS: afterwards nothing but the main program uses a bus."""
+    """Stop every AHRS. After that only the main program uses a bus."""
     for ahrs in list(running):
         ahrs.stop()
 
@@ -41,7 +41,7 @@ def stop():
 def from_board(board, **settings):
     """An AHRS of the sensors and settings of a board's module (boards/README.md), not started.
 
-    settings: as of AHRS, in place of the board's.
+    settings: those of AHRS; they replace the board's.
     """
     options = {
         "magnetometer": getattr(board, "magnetometer", None),
@@ -58,30 +58,30 @@ def from_board(board, **settings):
 
 
 class AHRS:
-    """Attitude from a sensor, step by step in an interrupt, and what it means in degrees.
+    """The attitude of a sensor, computed step by step in an interrupt, and read in degrees.
 
     sensor        a driver: MPU6050(i2c), MPU6500(spi, select), ...
     rate          steps per second: int, or (num, den) for num/den Hz
     filter        its name in filters.py; None: inertial9 with a magnetometer, else inertial6
-    magnetometer  a driver, or a function that makes it of the sensor's driver
+    magnetometer  a driver, or a function that takes the sensor's driver and returns one
     drive         "timer", "fifo", "data_ready" or "manual"; None: timer where timers are hard, else fifo
-    timer         None: the best one of the port; its number; or a make_tick(rate, callback) as of timing.py
-    calibration   the file of corrections, see calibration.py; None: none
-    display       a driver, or a function that makes it of display_chunk; with display_shares_bus it is on the sensor's
-                  bus, and the tick writes what its show() hands over
-    on_step       called with this object in the tick, after each step, for control loops; for it hold the rules of
-                  a hard interrupt: it may not allocate, nor take long. Its exceptions are counted, see status()
-    data_ready    the pin that the sensor's INT line is on, or a function that makes it: for that drive
-    board         the board's name, of which a calibration file may be
-    say           called with a title and short lines while a person has to wait or to do something
-    log           called with what was found, as print is; None: nobody wants to know
+    timer         None: the best timer of the port; a timer's number; or a make_tick(rate, callback) as in timing.py
+    calibration   the name of the calibration file, see calibration.py; None: no corrections
+    display       a driver, or a function that takes display_chunk and returns one. With display_shares_bus it is on the
+                  sensor's bus, and the tick sends what its show() has marked as ready
+    on_step       called with this object in the tick after each step, for control loops. The rules of a hard interrupt
+                  hold for it: it must not allocate or take long. Its exceptions are counted, see status()
+    data_ready    for the drive of that name: the pin of the sensor's INT line, or a function that returns it
+    board         the board's name; a calibration file of another board is refused
+    say           called with a title and short lines when a person has to wait or to do something
+    log           called like print with what was found; None: silent
 
-    All other settings of settings.py, in lower case, too: accel_range_g=4, imu_axes=("y", "-x", "z"), euler="zxy", ...
+    All other settings of settings.py in lower case: accel_range_g=4, imu_axes=("y", "-x", "z"), euler="zxy", ...
 
-    Constructing touches no bus. start() finds, configures and calibrates the sensor and lets the tick run; stop() ends
-    it; `with` does both. sensor, magnetometer, calibration, filter, tick, ticker and display are there to be looked at.
+    The constructor touches no bus. start() finds, configures and calibrates the sensor and starts the tick. stop() ends
+    it. `with` does both. sensor, magnetometer, calibration, filter, tick, ticker and display may be read.
 
-    A KeyboardInterrupt that comes while the tick runs does not stop it: the next call from the program raises it.
+    A KeyboardInterrupt during the tick does not stop the tick: the next call from the program raises it.
     """
 
     def __init__(
@@ -125,7 +125,7 @@ class AHRS:
         self.ticker = None
         self._guard = None
         self.bias = Bias(self)
-        self.notes = []  # what the start could not do, in a few words each
+        self.notes = []  # what start() could not do, in a few words each
         self.yaw_zero = (
             0,
             0,
@@ -135,10 +135,10 @@ class AHRS:
     # ------------------------------------------------------------------------------------ start and stop
 
     def start(self):
-        """Find, configure and calibrate the sensor, take the attitude from its first sample, let the tick run.
+        """Find, configure and calibrate the sensor, take the attitude from its first sample, start the tick.
 
-        Settings come first, all of them, before anything moves. Raises ValueError for those that cannot be, with what
-        to change, and the driver's OSError when the sensor does not answer. One that runs already starts anew.
+        All settings are checked before any chip is touched. Raises ValueError for wrong ones, with what to change, and
+        the driver's OSError when the sensor does not answer. A running AHRS is stopped first.
         """
         self.stop()
         settings = self.settings
@@ -165,7 +165,7 @@ class AHRS:
         return self
 
     def stop(self):
-        """End the tick: the bus is the program's again. The last attitude stays."""
+        """Stop the tick. The bus belongs to the program again. The last attitude stays."""
         if self not in running:
             return
         running.remove(self)
@@ -182,7 +182,7 @@ class AHRS:
         self.stop()
 
     def _neighbours(self):
-        """Those that run on the same bus. One that has the same chip is stopped: it was left by a program."""
+        """The running AHRS on the same bus. One of the same chip is stopped: an earlier program has left it running."""
         bus, chip = _place(self)
         found = []
         for other in list(running):
@@ -194,7 +194,7 @@ class AHRS:
         return found
 
     def _choose_drive(self, neighbours):
-        """The drive, and whether its timer can be had: one is made for a moment."""
+        """Choose the drive, and check its timer: one is made for a moment."""
         settings = self.settings
         drive = settings.DRIVE
         if neighbours:
@@ -260,7 +260,7 @@ class AHRS:
         self._load_calibration()
         if self._filter_in_sensor:
             self.filter = sensor
-            self.bias.known = True  # it takes care of that itself
+            self.bias.known = True  # the sensor corrects it itself
         else:
             self.filter = filters.make(name, rate, sensor, settings.GAINS)
             self.bias.find()
@@ -277,7 +277,7 @@ class AHRS:
             self.display.begin()
             self._display_found = True
         except OSError as why:
-            # the attitude is worth having without a display; it may still appear
+            # the attitude is useful without a display, which may still appear
             self.log("display:", why)
 
     def _open_sensor(self):
@@ -288,7 +288,7 @@ class AHRS:
             sensor.configure()
             self.log("dmp: image %s, %d bytes" % (sensor.version, sensor.image.size))
         else:
-            # SENSOR_RATE_HZ is the timer drive's
+            # SENSOR_RATE_HZ is for the timer drive only
             faster = settings.SENSOR_RATE_HZ if self.drive in ("timer", "manual") else None
             sensor.configure(
                 accel_range_g=settings.ACCEL_RANGE_G,
@@ -302,7 +302,7 @@ class AHRS:
         )
 
     def _open_magnetometer(self):
-        """Without it, or until it answers, the attitude comes from six axes."""
+        """Configure the magnetometer. Until it answers, the attitude comes from six axes."""
         mag = self._magnetometer
         if mag is None:
             return
@@ -312,8 +312,8 @@ class AHRS:
         rate = settings.RATE if settings.EXTERNAL_CLOCK else sensor.sample_rate
         if self._own_mag is None and self.drive == "timer" and rate != settings.RATE:
             raise ValueError(
-                "the magnetometer's sample comes with one of the IMU's and none may go by unread: "
-                "SENSOR_RATE_HZ has to be RATE"
+                "each magnetometer sample comes with one of the IMU's, so all of these must be read: "
+                "set SENSOR_RATE_HZ to RATE"
             )
         try:
             mag.configure(rate_hz=settings.MAG_RATE_HZ, sample_rate=rate)
@@ -321,7 +321,7 @@ class AHRS:
         except OSError as why:
             self.log("magnetometer:", why)
             self.notes.append("no magnetometer")
-            mag.attach()  # should it answer yet, the tick finds it and sets it up
+            mag.attach()  # if it answers later, the tick finds it and sets it up
 
     def _load_calibration(self):
         sensor, settings = self.sensor, self.settings
@@ -339,11 +339,11 @@ class AHRS:
 
     @property
     def counts(self):
-        """The newest sample as the filter gets it: calibrated, in the body's frame."""
+        """The newest sample as the filter gets it: calibrated, in the body frame."""
         return self.sensor.counts if self.calibration.identity else self.calibration.counts
 
     def sample(self):
-        """Read a sample while no tick does -> its flags."""
+        """Read a sample while the tick is stopped. Returns its flags."""
         flags = self.sensor.read()
         if self._own_mag is not None:
             flags = self._own_mag.read(self.sensor.counts)
@@ -352,8 +352,8 @@ class AHRS:
         return flags
 
     def _seed(self):
-        """The attitude from a first sample, heading included where a magnetometer has one; from level when none comes
-        (the tick's feedback does the rest)."""
+        """Take the attitude from a first sample, with the heading if a magnetometer has one. Without a sample it starts
+        level, and the tick's feedback corrects it."""
         start = time.ticks_ms()
         passed = 0
         read_us = None
@@ -363,7 +363,7 @@ class AHRS:
             took = time.ticks_diff(time.ticks_us(), began)
             read_us = took if read_us is None else min(took, read_us)
             passed = time.ticks_diff(time.ticks_ms(), start)
-            # one sample in several has the magnetometer's: none may go by unread
+            # only one in several samples has the magnetometer's: read them all
             ready = self.magnetometer is None or self.filter.AXES < 9 or flags & 2
             ready = ready or passed > _HEADING_MS
             if flags & 1 and ready and self.filter.seed(self.counts):
@@ -373,7 +373,7 @@ class AHRS:
         self.log("seed: no usable accelerometer sample, starting level")
 
     def _demand_time(self, read_us):
-        """A step has to fit into its period: the bus was timed, the filter is, on a twin."""
+        """Raise ValueError if a step is longer than its period: read_us on the bus, and the filter, timed on a twin."""
         twin = filters.make(self._filter_name, self.rate, self.sensor, self.settings.GAINS)
         best = None
         for _ in range(2):
@@ -397,7 +397,9 @@ class AHRS:
             0 if self.drive == "fifo" else self.period_us,
             display,
             self.settings.DISPLAY_CHUNK,
-            ticks.FOLLOW_CHIP if self.drive == "data_ready" else ticks.FOLLOW_TIMER,
+            ticks.PHASE_GAIN_SHIFT_CHIP
+            if self.drive == "data_ready"
+            else ticks.PHASE_GAIN_SHIFT_TIMER,
             None if self.calibration.identity else self.calibration,
             self._own_mag,
             self._on_step,
@@ -405,7 +407,7 @@ class AHRS:
         )
         tick.seeded()
         if display is not None and self._display_found:
-            while display.busy:  # the bus is the tick's from here on
+            while display.busy:  # from here on the tick owns the bus
                 display.flush_step(self.settings.DISPLAY_CHUNK)
         if self.drive == "fifo":
             self.sensor.fifo_enable(FIFO_BATCH)
@@ -419,15 +421,15 @@ class AHRS:
         return self.reading().angles(order)
 
     def quaternion(self):
-        """(w, x, y, z): turns a vector of the body into the earth's frame (x north, y west, z up)."""
+        """(w, x, y, z): turns body vectors into the earth frame (x north, y west, z up)."""
         return self.reading().quaternion()
 
     def rates(self):
-        """Rates of turn about body x, y, z in deg/s, free of the gyro's bias."""
+        """Angular rates about body x, y, z in deg/s, without the gyro's bias."""
         return self.reading().rates()
 
     def acceleration(self):
-        """What the accelerometer feels along body x, y, z in g."""
+        """What the accelerometer measures along body x, y, z in g."""
         return self.reading().acceleration()
 
     def linear_acceleration(self, frame="body"):
@@ -439,20 +441,20 @@ class AHRS:
         return self.reading().heading()
 
     def turns(self):
-        """The yaw as turns to the left, past half a turn as well."""
+        """The yaw with its full turns, in turns to the left."""
         return self.reading().turns()
 
     def temperature(self):
-        """Of the sensor's chip, in degC."""
+        """Temperature of the sensor chip in degC."""
         return self.reading().temperature()
 
     def reading(self):
-        """All of the above of one and the same step: a Reading."""
+        """A Reading: all of the above, of one step."""
         self._attend()
         return Reading(self)
 
     def wait(self, timeout_ms=1000):
-        """Wait for the next step -> its Reading. Raises OSError when none comes."""
+        """Wait for the next step; returns its Reading. Raises OSError when none comes."""
         steps = self._attend()
         start = time.ticks_ms()
         while self.tick.steps == steps:
@@ -474,24 +476,24 @@ class AHRS:
         return self.reading()
 
     def step(self):
-        """One step, with the manual drive: the program calls it once a period. Late calls are coasted through."""
+        """Do one step, with the manual drive: call it once a period. The filter coasts through late calls."""
         if self.drive != "manual" or self not in running:
             raise RuntimeError('step() is for the "manual" drive, and started')
         self.tick.on_sample(None)
         self._attend()
 
     def zero_yaw(self):
-        """From now on the yaw counts from where the body points now. heading() goes on from north."""
+        """Count the yaw from the present direction. heading() stays relative to north."""
         reading = self.reading()
         self.yaw_zero = (0, 0)
         yaw = reading.unwrapped_mdeg()
         self.yaw_zero = ((yaw + 180000) % 360000 - 180000, yaw)
 
     def level(self, save=True):
-        """The body is level as it lies now: the trim of a tilted mounting, up to 45 degrees, kept in the calibration
-        file if `save`. Set-up, with the body at rest: the tick is held for it, and the filter settles anew.
+        """Make the present position level: the trim of a tilted mounting, up to 45 degrees. `save` stores it in the
+        calibration file. Hold the body at rest: the tick is stopped meanwhile, and the filter settles anew.
 
-        Raises ValueError while it turns, and for more tilt.
+        Raises ValueError while the body turns, and for more tilt.
         """
         if self._filter_in_sensor:
             raise ValueError(
@@ -513,7 +515,7 @@ class AHRS:
                 _run_together(together)
 
     def _trim(self):
-        """The calibration gets the present tilt as its trim, the filter is turned along with the body's frame."""
+        """Give the calibration the present tilt as its trim, and turn the filter with the body frame."""
         calibration, filter = self.calibration, self.filter
         bias = array("i", [0] * 3)
         filter.bias(bias)
@@ -524,7 +526,7 @@ class AHRS:
         calibration.set_level([round(2000000 * u) for u in up])
         after = calibration.fields["up_ppm"]
         filter.set_quaternion(*_times(q, _turn_of(after, -1)))
-        # the bias, from the one body's frame into the other
+        # the bias, from the old body frame into the new one
         v = _turned(_turn_of(before, -1), [bias[i] for i in range(3)])
         v = _turned(_turn_of(after, 1), v)
         filter.set_bias(*[round(b) for b in v])
@@ -533,7 +535,7 @@ class AHRS:
         self.tick.seeded()
 
     def status(self):
-        """What it is and how it fares, as a dict: names, flags and counters."""
+        """A dict of names, flags and counters; docs/face.md explains each."""
         self._attend()
         sensor, mag, tick, filter = self.sensor, self.magnetometer, self.tick, self.filter
         doubt = getattr(filter, "heading_uncertainty_mdeg", None)
@@ -581,10 +583,8 @@ class AHRS:
         return found
 
     def refresh_display(self):
-        """Write a piece of what the display's show() has handed over, where the tick does not -> whether more is left.
-
-        For the main loop, as often as it can.
-        """
+        """Send a chunk to a display on its own bus, from the main loop as often as possible. Returns whether more is
+        left."""
         self._attend()
         display = self.display
         if display.busy and not self.settings.DISPLAY_SHARES_BUS:
@@ -592,8 +592,8 @@ class AHRS:
         return display.busy
 
     def _attend(self):
-        """What every call from the program sees to -> the steps so far: an interrupt that landed in the tick, the rate,
-        and now and then the bias and the DMP."""
+        """Every call from the program does this: it raises an interrupt that came during the tick, measures the rate,
+        and checks bias and DMP now and then. Returns the number of steps."""
         tick = self.tick
         if tick is None:
             raise RuntimeError("not started: start() comes first")
@@ -625,7 +625,7 @@ class AHRS:
         return tick.steps
 
     def _reload(self):
-        """The chip has lost its program. To load it takes the bus for most of a second, so the tick has to stop."""
+        """Load the DMP's program again. It takes the bus for most of a second, so the tick is stopped."""
         together = [other for other in running if other.ticker is self.ticker]
         for other in together:
             other._hold()
@@ -648,7 +648,7 @@ class AHRS:
 
     @micropython.native
     def snapshot(self, out):
-        """The newest step as integers into out, array('i') of tick.SNAPSHOT_WORDS: see the words in tick.py."""
+        """Copy the newest step as integers into out, array('i') of tick.SNAPSHOT_WORDS; tick.py names the words."""
         return self.tick.snapshot(out)
 
     @micropython.native
@@ -661,7 +661,7 @@ class AHRS:
 
     @micropython.native
     def rates_into(self, out):
-        """Rates of turn about body x, y, z, free of the gyro's bias, in millidegrees/s into out, array('i') of 3."""
+        """Angular rates about body x, y, z, without the bias, in millidegrees/s into out, array('i') of 3."""
         self.tick.rates_into(out)
 
 
@@ -682,7 +682,7 @@ class _Together:
 
 
 def _run_together(members):
-    """Let these tick, all of one bus: their tickers are stopped."""
+    """Start the ticks of these AHRS, all on one bus. Their tickers are stopped."""
     first = members[0]
     for member in members:
         member.tick.resume()
@@ -705,9 +705,10 @@ def _run_together(members):
 
 
 def _place(ahrs):
-    """(bus, chip) of the sensor, as text: a port prints two objects of one bus alike, and two buses never.
+    """(bus, chip) of the sensor, as text: a port prints two objects of one bus alike, and those of two buses
+    differently.
 
-    None, None of a driver that does not say.
+    (None, None) if the driver does not say.
     """
     registers = getattr(ahrs._driver, "registers", None)
     return [repr(part) for part in registers.place] if hasattr(registers, "place") else (None, None)
@@ -721,7 +722,7 @@ def _nothing(*_):
 
 
 def _turn_of(up, sign):
-    """The quaternion of a trim, 1, or of its opposite, -1: the shortest turn that takes `up` to z."""
+    """The quaternion of a trim: the shortest turn that takes `up` to z. sign -1: the opposite turn."""
     if up is None:
         return 1.0, 0.0, 0.0, 0.0
     a, b, c = [u / 1000000 for u in up]

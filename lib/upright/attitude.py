@@ -1,4 +1,4 @@
-# What the attitude filters of this library have in common: how they are told of the sensor, and how they are read.
+# What all attitude filters have in common: the sensor's scales, the state, and the readings.
 # Needs fixmath.py. Every port.
 
 import math
@@ -25,15 +25,15 @@ class Attitude:
     accel_lsb_per_g   int, 64..32767
     state             array('i'); state[QUATERNION] and the next three words are w x y z in Q29, body to earth
 
-    A filter has besides: NAME, AXES (6 or 9), update(counts), seed(counts), set_bias(x, y, z, known_s), and
-    start_at(q), which takes four words in Q29 and starts from there. A class below it names update
-    again: MicroPython finds it at once then, where a look-up in the class above costs 400 instructions in each step.
+    A filter adds NAME, AXES (6 or 9), update(counts), seed(counts), set_bias(x, y, z, known_s), and start_at(q), which
+    takes four words in Q29 and starts from there. A subclass of a filter assigns update again: MicroPython then finds
+    it at once, while a look-up in the base class costs 400 instructions in each step.
     """
 
     QUATERNION = _Q  # where w x y z (Q29) stand in `state`
 
     def __init__(self, rate, gyro_scale, accel_lsb_per_g, words):
-        """Take the scales, or raise ValueError; make a state of so many words."""
+        """Check the scales, or raise ValueError; make a state of so many words."""
         self.rate = ratio_of(rate, "rate", "Hz")
         self.gyro_scale = ratio_of(gyro_scale, "gyro_scale", "LSB per deg/s")
         if not isinstance(accel_lsb_per_g, int) or not 64 <= accel_lsb_per_g <= 32767:
@@ -45,11 +45,11 @@ class Attitude:
 
     @classmethod
     def for_sensor(cls, imu, **gains):
-        """The filter for samples of the driver `imu`, configured before: its sample rate and its scales."""
+        """A filter for a configured driver `imu`, with its sample rate and scales."""
         return cls(imu.sample_rate, imu.gyro_scale, imu.accel_lsb_per_g, **gains)
 
     def hold(self, state):
-        """Take this array('i') as the state."""
+        """Use this array('i') as the state."""
         self.state = state
         self._q = memoryview(state)[_Q : _Q + 4]
         state[_PROBE] = -1

@@ -1,17 +1,17 @@
-# The gyro's bias: measured or taken from the calibration file at the start, and kept there when a filter has learnt it.
-# Needs an AHRS, with whose sensor, filter, calibration and settings it works. Every port.
+# The gyro's bias: measured at the start or read from the calibration file, and stored there when a filter has learnt
+# it. Needs an AHRS, whose sensor, filter, calibration and settings it uses. Every port.
 
 import time
 from array import array
 
 from micropython import const
 
-# So long at rest, and what the filter has learnt of the bias is worth keeping
+# The filter's bias is stored after so long at rest
 _KEEP_AFTER_S = const(10)
 _KEEP_EVERY_S = const(600)  # at least between two writes of the flash
 _KEEP_MDPS = const(20)  # and a change
 
-# At rest: what the gyro and accelerometer of an MPU6050 may move in a window, and how far a bias may lie (PS 6.1:
+# At rest: the most that gyro and accelerometer of an MPU6050 may change in a window, and the largest bias (PS 6.1:
 # zero-rate output +-20 deg/s).
 _REST_GYRO_DPS = const(3)
 _REST_ACCEL_MG = const(120)
@@ -22,7 +22,7 @@ _REST_READS_HZ = const(200)  # at least, with the slowest bus
 
 
 class Bias:
-    """The gyro's bias of an AHRS's filter; known: it was measured, stored, or learnt."""
+    """The gyro's bias of an AHRS's filter. known: it was measured, stored, or learnt."""
 
     def __init__(self, ahrs):
         self.known = False
@@ -32,9 +32,9 @@ class Bias:
         self._learnt = array("i", [0] * 3)
 
     def find(self):
-        """A first value: the stored one, or one that is measured, or none."""
+        """Give the filter a first value: the stored bias, or a measured one, or none."""
         ahrs = self._ahrs
-        # a filter that learns the bias by itself wants a first value, but nobody has to wait for it
+        # a filter that learns the bias takes a first value if there is one, but start() does not wait long for it
         learns = hasattr(ahrs.filter, "resting")
         if not learns or not self._use_stored():
             if ahrs.settings.MEASURE_BIAS:
@@ -55,8 +55,8 @@ class Bias:
         return True
 
     def keep(self, seconds=1):
-        """Every few seconds: what the filter has learnt of the bias into the calibration file, at rest and seldom, as a
-        write of the flash holds up everything for some hundredths of a second on most boards."""
+        """Call this every few seconds. It stores the learnt bias in the calibration file, only at rest and rarely: on
+        most boards a write to the flash blocks everything for some hundredths of a second."""
         ahrs = self._ahrs
         self._kept_s += seconds
         if not ahrs.filter.resting:
@@ -84,7 +84,7 @@ class Bias:
             ahrs.log("bias: not kept:", why)
 
     def _measure(self, tries):
-        """Mean of the gyro over a window at rest -> True; False when it never rested."""
+        """Set the bias to the mean of the gyro over a window at rest. Returns False if the board was never at rest."""
         ahrs = self._ahrs
         sensor = ahrs.sensor
         counts = ahrs.counts
@@ -94,7 +94,7 @@ class Bias:
         accel_most = sensor.accel_lsb_per_g * _REST_ACCEL_MG // 1000
         settings = ahrs.settings
         rate_num, rate_den = settings.RATE if settings.EXTERNAL_CLOCK else sensor.sample_rate
-        # half of what the chip and this loop can give
+        # half of what the chip and this loop can deliver
         enough = min(rate_num // rate_den, _REST_READS_HZ) * _REST_WINDOW_MS // 2000
         for k in range(tries):
             low = array("h", [32767] * 6)

@@ -1,7 +1,6 @@
-# The filters that the firmware and the host tools can choose from, by name. Needs the modules of those that
-# are made, and no others. Every port.
+# The registry of filters, by name. Needs the modules of those that are made, and no others. Every port.
 
-# name: (module, class) of lib/; a module is imported when one of its filters is made, so that the others take no memory
+# name: (module, class); a module is imported when one of its filters is made, so the others take no memory
 FILTERS = {
     "mahony6": ("mahony", "Mahony6"),
     "mahony9": ("mahony", "Mahony9"),
@@ -15,17 +14,17 @@ FILTERS = {
     "dmp6": ("dmp", "MpuDmp"),
 }
 
-# These are computed by the sensor itself: driver and filter are one object, so no samples can be handed to them.
+# The sensor itself computes these: driver and filter are one object, and samples cannot be passed to them.
 HARDWARE = ("dmp6",)
 
 
 def default(magnetometer):
-    """The name of the filter where none is asked for."""
+    """The name of the default filter."""
     return "inertial9" if magnetometer else "inertial6"
 
 
 def check(name):
-    """Raise ValueError for a name that no filter has."""
+    """Raise ValueError for an unknown name."""
     if name not in FILTERS:
         raise ValueError("unknown filter %r; there are %s" % (name, ", ".join(sorted(FILTERS))))
 
@@ -33,12 +32,12 @@ def check(name):
 def make(name, rate, imu, gains):
     """Build a filter by its name for samples of `imu` (its scales) at `rate` (Hz, or (num, den) Hz).
 
-    gains: dict of the filter's own keyword arguments, {} for its defaults. Raises ValueError for an unknown name, and
-    for what the filter does not take.
+    gains: dict of the filter's own keyword arguments, {} for its defaults. Raises ValueError for an unknown name and
+    for arguments that the filter does not accept.
     """
     check(name)
     if name in HARDWARE:
-        raise ValueError("%s is computed in the sensor: no samples can be handed to it" % name)
+        raise ValueError("%s runs in the sensor: it cannot take samples" % name)
     kind = _class(name)
     try:
         return kind(rate, imu.gyro_scale, imu.accel_lsb_per_g, **gains)

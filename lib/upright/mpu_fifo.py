@@ -85,7 +85,7 @@ class Fifo:
         self._monitor = monitor
         self._counts = counts
         self._byte = bytearray(1)
-        self._two = bytearray(2)
+        self._pair = bytearray(2)
         self._status = bytearray(1)
         self._read_into = registers.read_into
         self._write = registers.write
@@ -167,11 +167,11 @@ class Fifo:
         """FIFO_COUNT; 0 also when the bus fails."""
         try:
             # high byte first: it latches the low (RM 4.30)
-            self._read_into(_FIFO_COUNTH, self._two)
+            self._read_into(_FIFO_COUNTH, self._pair)
         except OSError:
             self._monitor.fault()
             return 0
-        level = self._two[0] << 8 | self._two[1]
+        level = self._pair[0] << 8 | self._pair[1]
         if level <= self.size:
             return level
         self._monitor.fifo_misaligned = (

@@ -1,4 +1,4 @@
-# What an AHRS has made of one step, in the units of people: degrees, g, degC. All of a reading is of the same step.
+# The readings of one step of an AHRS in floats: degrees, g, degC. All values belong to the same step.
 # Needs fixmath.py and what tick.py publishes. It uses floats and allocates: not for interrupts. Every port.
 
 import math
@@ -9,11 +9,11 @@ from upright import tick as ticks
 
 
 class Reading:
-    """The step that an AHRS had done last when this was made.
+    """The newest step of an AHRS at the time when this was made.
 
     step   the number of the step, from 1; 0: the attitude of the start, before the first step
-    flags  of its sample: bit 0 a fresh one, bit 1 with a fresh magnetometer sample, bits 2 and 3 an axis of the
-           accelerometer or the gyro at full scale
+    flags  of its sample: bit 0 fresh, bit 1 with a fresh magnetometer sample, bits 2 and 3 an axis of the accelerometer
+           or the gyro at full scale
     """
 
     def __init__(self, ahrs):
@@ -32,14 +32,14 @@ class Reading:
         self.flags = words[ticks.FLAGS]
 
     def angles(self, order=None):
-        """(roll, pitch, yaw) in degrees, yaw to the left, within +-180; order: "zyx", "zxy"; None: EULER."""
+        """(roll, pitch, yaw) in degrees; yaw within +-180, positive to the left; order "zyx", "zxy"; None: EULER."""
         mdeg = array("i", [0] * 3)
         fixmath.euler(self._words, mdeg, order or self._ahrs.settings.EULER)
         yaw = (mdeg[2] - self._zero[0] + 180000) % 360000 - 180000
         return mdeg[0] / 1000, mdeg[1] / 1000, yaw / 1000
 
     def quaternion(self):
-        """(w, x, y, z) of unit length: turns a vector of the body into the earth's frame."""
+        """(w, x, y, z) of unit length: turns body vectors into the earth frame."""
         words = self._words
         w, x, y, z = words[0], words[1], words[2], words[3]
         norm = math.sqrt(w * w + x * x + y * y + z * z)
@@ -48,18 +48,18 @@ class Reading:
         return c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w
 
     def rates(self):
-        """Rates of turn about body x, y, z in deg/s, free of the gyro's bias."""
+        """Angular rates about body x, y, z in deg/s, without the gyro's bias."""
         num, den = self._ahrs.sensor.gyro_scale
         words = self._words
         return tuple([words[ticks.GYRO + i] * den / num - self._bias[i] / 1000 for i in range(3)])
 
     def acceleration(self):
-        """What the accelerometer feels along body x, y, z in g: +1 on z at rest and level."""
+        """What the accelerometer measures along body x, y, z in g: +1 on z at rest and level."""
         lsb = self._ahrs.sensor.accel_lsb_per_g
         return tuple([self._words[ticks.ACCEL + i] / lsb for i in range(3)])
 
     def linear_acceleration(self, frame="body"):
-        """The same without gravity, in g, along the axes of the "body" or of the "earth"."""
+        """The same without gravity, in g, in the "body" or the "earth" frame."""
         w, x, y, z = self.quaternion()
         a, b, c = self.acceleration()
         a -= 2 * (x * z - w * y)
@@ -76,7 +76,7 @@ class Reading:
         return a + 2 * (y * k - z * j), b + 2 * (z * i - x * k), c + 2 * (x * j - y * i)
 
     def heading(self):
-        """Where the nose points, in degrees clockwise from true north, 0..360; None with six axes."""
+        """Direction of body x in degrees clockwise from true north, 0..360; None with six axes."""
         ahrs = self._ahrs
         if ahrs.filter.AXES < 9:
             return None
@@ -85,7 +85,7 @@ class Reading:
         return (ahrs.settings.DECLINATION - mdeg[2] / 1000) % 360
 
     def turns(self):
-        """The yaw as turns to the left since the start or zero_yaw(), past half a turn as well."""
+        """The yaw with its full turns since the start or zero_yaw(), in turns to the left."""
         return (self.unwrapped_mdeg() - self._zero[1]) / 360000
 
     def unwrapped_mdeg(self):
@@ -96,10 +96,10 @@ class Reading:
         order = self._ahrs.settings.EULER
         if order == "zyx":
             return whole
-        # turns are counted of the yaw in the order zyx; the other one is that near to it
+        # full turns are counted for the yaw of zyx; the yaw of the other order is within half a turn of it
         fixmath.euler(self._words, mdeg, order)
         return mdeg[2] + 360000 * ((whole - mdeg[2] + 180000) // 360000)
 
     def temperature(self):
-        """Of the sensor's chip, in degC."""
+        """Temperature of the sensor chip in degC."""
         return self._ahrs.sensor.temperature_cdeg() / 100

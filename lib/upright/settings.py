@@ -1,51 +1,51 @@
-# The settings of a board: what they are when nobody says otherwise, and which values they can have.
+# The settings of a board: their defaults and their valid values.
 # Needs calibration.py, filters.py. Every port.
 
 from upright import calibration, filters
 
 DEFAULTS = {
-    # Sampling. RATE: steps of the filter in Hz, or (num, den) for num/den Hz, whatever drives them.
+    # Sampling. RATE: steps of the filter in Hz, or (num, den) for num/den Hz, with every drive.
     "RATE": 200,
-    # "timer": a timer's tick reads the newest sample; "data_ready": the chip's INT line is the tick;
-    # "fifo": a timer at FIFO_HZ fetches the samples that the chip has queued; "manual": the program calls step().
-    # None: "timer" where timers interrupt the program, "fifo" where they wait for it.
+    # "timer": a timer's tick reads the newest sample. "data_ready": the chip's INT line is the tick.
+    # "fifo": a timer at FIFO_HZ fetches the samples that the chip has queued. "manual": the program calls step().
+    # None: "timer" where timer callbacks are hard, "fifo" where they are soft.
     "DRIVE": None,
-    # Of the chip with the timer drive, Hz; None: as RATE. The chip may sample faster than it is read: a tick then
-    # never comes too early for a fresh sample, and its filter (DLPF) keeps the rest from aliasing.
+    # The chip's sample rate with the timer drive, Hz; None: RATE. The chip may sample faster than it is read: a tick
+    # then always finds a fresh sample, and the chip's filter (DLPF) prevents aliasing.
     "SENSOR_RATE_HZ": None,
     "FIFO_HZ": 50,
-    # True where something else clocks the chip's samples (the simulator replaying a trial).
+    # True if something else clocks the chip's samples (the simulator when it replays a trial).
     "EXTERNAL_CLOCK": False,
     "ACCEL_RANGE_G": 8,
     "GYRO_RANGE_DPS": 2000,
     "DLPF": 2,
-    # How the chips sit on the board: body x, y, z (forward, left, up) each as an axis of the chip, "x", "-y", ...
+    # How the chips are mounted: body x, y, z (forward, left, up) each as an axis of the chip, "x", "-y", ...
     "IMU_AXES": ("x", "y", "z"),
     "MAG_AXES": ("x", "y", "z"),
-    # Of the magnetometer, where board.py has one.
+    # The magnetometer's rate, if board.py has one.
     "MAG_RATE_HZ": 100,
     # Corrections and biases, see calibration.py; made by `upright calibrate`. None: no file.
     "CALIBRATION": "upright_cal.json",
-    # The filter by its name in filters.py; None: inertial9 where there is a magnetometer, else inertial6. And its
-    # own arguments, where its defaults are not wanted.
+    # The filter, by its name in filters.py; None: inertial9 with a magnetometer, else inertial6. GAINS: its own
+    # arguments, {} for its defaults.
     "FILTER": None,
     "GAINS": {},
     "EULER": "zyx",
-    # Of the place, in degrees, east positive: a compass points so far to the right of true north.
+    # Magnetic declination of the place in degrees: positive if a compass points east of true north.
     "DECLINATION": 0,
-    # For the filter "dmp6": the file with the DMP's image, which the user has to have, and its SHA-256 where the
-    # library does not know it; `upright dmp check FILE` shows it.
+    # For the filter "dmp6": the file with the DMP's image, which the user supplies, and its SHA-256 if the library
+    # does not know the image; `upright dmp check FILE` shows it.
     "DMP_IMAGE": "dmp.bin",
     "DMP_SHA256": None,
-    # Measure the gyro's bias at the start (the board has to lie still for a second).
+    # Measure the gyro's bias at the start (the board must be at rest for a second).
     "MEASURE_BIAS": True,
-    # A filter that learns the gyro's bias: write it into the calibration file when the board rests, for the next start.
+    # Store the bias that a filter has learnt in the calibration file when the board is at rest, for the next start.
     "KEEP_BIAS": True,
-    # True: the display is on the sensor's bus, so the tick writes it, DISPLAY_CHUNK bytes at a time.
-    # False: it has a bus of its own and the main program writes it.
+    # True: the display is on the sensor's bus, and the tick writes it, DISPLAY_CHUNK bytes at a time.
+    # False: it has its own bus, and the main program writes it.
     "DISPLAY_SHARES_BUS": True,
     "DISPLAY_CHUNK": 32,
-    # Seconds between the display's pages; 0: only the first.
+    # Seconds that each page of the display is shown; 0: only the first page.
     "PAGE_SECONDS": 6,
 }
 
@@ -57,9 +57,9 @@ _GYRO_SCALES = {250: (131, 1), 500: (131, 2), 1000: (164, 5), 2000: (82, 5)}
 
 
 def of_board(board):
-    """What a board module says, {setting: value}.
+    """The settings of a board module, {setting: value}.
 
-    Raises ValueError for a name in capitals that no setting has: a slip of the pen would otherwise go unnoticed.
+    Raises ValueError for an unknown name in capitals, because a typing error would otherwise go unnoticed.
     """
     found = {}
     for name in dir(board):
@@ -69,15 +69,15 @@ def of_board(board):
             found[name] = getattr(board, name)
         elif name not in _NO_SETTINGS:
             raise ValueError(
-                "board.py sets %s, which is no setting; see upright/settings.py" % name
+                "board.py sets %s, which is not a setting; see upright/settings.py" % name
             )
     return found
 
 
 class Settings:
-    """DEFAULTS with what `given` says otherwise, {setting: value}, as attributes. RATE is always a pair.
+    """The DEFAULTS, replaced by `given`, {setting: value}, as attributes. RATE is always a pair.
 
-    Raises ValueError for a name that no setting has.
+    Raises ValueError for an unknown name.
     """
 
     def __init__(self, given):
@@ -90,10 +90,10 @@ class Settings:
             self.RATE = (self.RATE, 1)
 
     def check(self, axes=6, drive=None):
-        """Look at every setting, for a board whose sensors have so many axes; drive: that which DRIVE = None became.
+        """Check every setting, for sensors with so many axes. drive: the drive that was chosen for DRIVE = None.
 
-        Raises ValueError with all that cannot be, each with what to change. What depends on the chip that is found
-        and on the timer is looked at later.
+        Raises ValueError that lists all wrong settings, each with what to change. What depends on the chip and on the
+        timer is checked later.
         """
         wrong = []
         rate = self.RATE
@@ -161,7 +161,7 @@ class Settings:
 
 
 class _Scales:
-    """What a filter wants to know of a sensor."""
+    """The scales of a sensor, for a filter."""
 
     def __init__(self, settings):
         self.gyro_scale = _GYRO_SCALES[settings.GYRO_RANGE_DPS]

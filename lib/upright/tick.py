@@ -1,6 +1,6 @@
 # The tick: sample, filter, published state, a bounded piece of the display. Runs in a hard interrupt.
-# Needs fixmath.py and viper. A driver (read, health, counts) and a filter (update, state) are handed in; where the
-# board has them, a calibration (apply, counts) and a magnetometer on a bus of the tick (read). Every port.
+# Needs fixmath.py and viper. A driver (read, health, counts) and a filter (update, state) are passed in, and where
+# the board has them a calibration (apply, counts) and a magnetometer on a bus of its own (read). Every port.
 
 from array import array
 from time import ticks_add, ticks_diff, ticks_us
@@ -11,9 +11,9 @@ from micropython import const
 from upright.fixmath import euler
 
 # The published state, array('i'): a sequence number, whether on_step is called, the side of north at the last step, and
-# the counters of steps, of steps with a fresh sample and of turns; then two sets. The newest is that of the sequence's
-# lowest bit; a step writes the other one and then moves the sequence on, so that a reader in an interrupt that cut into
-# the tick finds a whole set as well.
+# the counters of steps, of steps with a fresh sample, and of turns. Then come two sets. The lowest bit of the sequence
+# number selects the newest. A step writes the other one and then increments the sequence number, so an interrupt that
+# cuts into the tick also reads a complete set.
 _SEQUENCE = const(0)
 _CALLS = const(1)  # _CALL_ON_STEP or 0
 _SIDE = const(2)
@@ -33,34 +33,36 @@ ACCEL = const(8)
 GYRO = const(11)
 TEMPERATURE = const(14)
 
-# The timer's clock is the one that ticks_us shows, give or take make_tick's rounding (100 ppm: 0.1 of a period behind).
-FOLLOW_TIMER = const(10)
+# How fast the expected time of a tick follows the actual one: by late / 2**shift a tick.
+# A timer has the clock of ticks_us, but for make_tick's rounding (100 ppm: 0.1 of a period behind).
+PHASE_GAIN_SHIFT_TIMER = const(10)
 # The chip's clock on the data-ready line may be off by some percent (2 %: 0.64 of a period behind).
-FOLLOW_CHIP = const(5)
+PHASE_GAIN_SHIFT_CHIP = const(5)
 
 _FRESH = const(1)  # bit 0 of the flags: accelerometer and gyro
 _ANY_FRESH = const(3)  # bit 1: magnetometer
 _WRAP = const(0x3FFFFFFF)  # counters stay small ints
-# Steps between two looks at a configuration register while samples come in: a power of 2
+# Steps between two checks of a configuration register while samples arrive: a power of 2
 _HEALTH_EVERY = const(8)
-# What health() answers while it writes a chip's registers back; and how many of them a slow tick does at once
+# What health() returns while it restores a chip's registers; and how many of them a slow tick restores at once
 _REPAIRING = const(2)
 _REPAIRS = const(8)
-# Steps made up for at once: bounds the tick; past it the last rate says nothing
+# Missed ticks that one tick coasts through at most: it bounds the tick, and an older gyro rate means nothing
 _MOST_COASTS = const(16)
 
 
-# A reader is cut into by one step in 100 at most; more often and the tick leaves no time for anybody
+# Attempts to read one set. If 100 steps cut into as many, the tick leaves no time for a program
 _TRIES = const(100)
 
-# What _publish answers
+# What _publish returns
 _HEALTH_DUE = const(1)
 _CALL_ON_STEP = const(2)
 
 
 @micropython.viper
 def _publish(state: ptr32, q: ptr32, counts: ptr16) -> int:
-    """Write the set of this step; _HEALTH_DUE now and then and after every sample that failed, _CALL_ON_STEP as set.
+    """Write the set of this step. Returns _HEALTH_DUE every few steps and after every failed sample, and _CALL_ON_STEP
+    as set.
 
     Turns are counted where the yaw passes 180 deg: the sine of the yaw changes its sign while its cosine is negative.
     """
@@ -110,7 +112,7 @@ def _publish(state: ptr32, q: ptr32, counts: ptr16) -> int:
 
 @micropython.viper
 def _copy(state: ptr32, out: ptr32) -> int:
-    """The newest set into out; its sequence number."""
+    """Copy the newest set into out; returns its sequence number."""
     sequence = state[_SEQUENCE]
     at = _SETS
     if sequence & 1:
@@ -143,25 +145,25 @@ def _rates(state: ptr32, out: ptr32, num: int, den: int):
         i += 1
 
 
-# The methods of the tick are native code: it takes half the time, and a bytecode frame over 11 words, which a `try`
-# soon makes, would come from the heap where that is not locked.
+# The methods of the tick are native code: it takes half the time. And a `try` soon makes a bytecode frame larger than
+# 11 words, which comes from the heap when that is not locked.
 
 
 class Tick:
     """One step a sample: read -> calibrate -> update -> publish -> on_step, then at most `chunk` bytes of the display.
 
-    `on_sample` and `on_fifo` are the callbacks (made once here, since fetching a bound method allocates): on_sample
-    for a timer or the chip's data-ready line, on_fifo for a timer that drains the FIFO. They never raise: what
-    goes wrong is counted in `missed` (ticks that never came, made up for by coasting), `crashes` (with the last one
-    in `error`), `step_errors` (of on_step, the last in `step_error`), and in the driver's and display's own counters.
-    A KeyboardInterrupt that lands in the tick is kept in `interrupt` for the main program to raise.
+    `on_sample` and `on_fifo` are the callbacks: on_sample for a timer or the chip's data-ready line, on_fifo for a
+    timer that drains the FIFO. (They are made once, because fetching a bound method allocates.) They never raise.
+    Faults are counted in `missed` (ticks that did not come; the filter coasts through them), `crashes` (the last one is
+    in `error`), `step_errors` (of on_step; the last one is in `step_error`), and in the counters of driver and display.
+    A KeyboardInterrupt during the tick is stored in `interrupt`, for the main program to raise.
 
-    period_us    the sample period, to notice ticks that never came; 0 with the FIFO, whose packets say it
-    follow       how readily the expected time follows the ticks' own clock: by late / 2**follow a tick
-    display      given only where the tick owns the display's bus
-    calibration  None: the filter gets the driver's counts as they are
-    mag          a magnetometer that is read by itself, its bus being the tick's; None where it comes with the sample
-    on_step      called with `argument` after each step; the rules of a hard interrupt are its rules too
+    period_us         the sample period, to detect missed ticks; 0 with the FIFO, where each packet is a step
+    phase_gain_shift  the expected time of a tick follows the actual one by late / 2**phase_gain_shift a tick
+    display           only if the tick owns the display's bus
+    calibration       None: the filter gets the driver's raw counts
+    mag               a magnetometer on a bus of its own, which the tick owns; None if it comes with the sample
+    on_step           called with `argument` after each step; the rules of a hard interrupt hold for it
     """
 
     def __init__(
@@ -171,7 +173,7 @@ class Tick:
         period_us,
         display=None,
         chunk=32,
-        follow=FOLLOW_TIMER,
+        phase_gain_shift=PHASE_GAIN_SHIFT_TIMER,
         calibration=None,
         mag=None,
         on_step=None,
@@ -186,7 +188,7 @@ class Tick:
         self._display = display
         self._chunk = chunk
         self._period = period_us
-        self._follow = follow
+        self._phase_gain_shift = phase_gain_shift
         self._due = ticks_us()
         self._started = False
         self._coasted_ahead = 0
@@ -227,7 +229,7 @@ class Tick:
                 if self._display is not None:
                     self._display.flush_step(self._chunk)
         except BaseException as error:
-            # it must not stop the timer: counted, and shown by the main program
+            # it must not stop the timer: it is counted, and the main program shows it
             self._crashed(error)
         self._running = False
 
@@ -242,7 +244,7 @@ class Tick:
             if n == 0:
                 self._look_after()
             while n > 0:
-                imu.fifo_next()  # a packet that is withheld after a reset is a step all the same: it coasts
+                imu.fifo_next()  # a packet that is withheld after a reset is still a step: the filter coasts
                 if n == 1 and self._mag is not None:
                     self._mag.read(self._raw)
                 self._step()
@@ -255,8 +257,8 @@ class Tick:
 
     @micropython.native
     def _on_guard(self, source):
-        """Slow timer beside the data-ready line: a chip that has reset itself raises it no more, and has to be
-        found and put right all the same."""
+        """Slow timer beside the data-ready line. A chip that has reset itself no longer drives that line: it is
+        detected and restored here."""
         if self._running:
             return
         self._running = True
@@ -264,7 +266,7 @@ class Tick:
             if self._state[_STEPS] == self._seen:
                 self._imu.read()
                 self._look_after()
-                if self._display is not None:  # which is to show that the sensor is lost
+                if self._display is not None:  # it shows that the sensor is lost
                     self._display.flush_step(self._chunk)
             self._seen = self._state[_STEPS]
         except BaseException as error:
@@ -273,7 +275,7 @@ class Tick:
 
     @micropython.native
     def _look_after(self):
-        """Health of the chip from a tick that comes seldom: a repair is not to take a tick for each register."""
+        """Check the chip from a tick that comes rarely: it restores several registers at once."""
         n = _REPAIRS
         while n > 0 and self._imu.health() == _REPAIRING:
             n -= 1
@@ -288,10 +290,11 @@ class Tick:
 
     @micropython.native
     def _on_time(self):
-        """Coast through ticks that never came. False: this tick is one that was made up for and came late.
+        """Coast through ticks that did not come. False: this tick is late, and the filter has coasted through it
+        already.
 
-        Ticks are held against where the next one is due, not against the last one: a tick that always takes a
-        little longer than its period loses some, and every gap alone would look fit.
+        A tick is compared with its due time, not with the tick before. A tick that always takes a little longer than
+        its period loses some, and no single gap would show that.
         """
         period = self._period
         if period == 0:
@@ -311,7 +314,7 @@ class Tick:
                 return False
             if late < period >> 1:
                 self._coasted_ahead = 0
-        self._due = ticks_add(due, period + (late >> self._follow))
+        self._due = ticks_add(due, period + (late >> self._phase_gain_shift))
         return True
 
     def _coast(self, lost):
@@ -349,9 +352,9 @@ class Tick:
             else:
                 self.interrupt = error
 
-    # -- for the main program, while no tick comes
+    # -- for the main program, while the tick is stopped
     def seeded(self):
-        """Publish the filter's attitude and the newest counts as they are, as no step."""
+        """Publish the filter's attitude and the newest counts without counting a step."""
         state = self._state
         was = [state[i] for i in (_STEPS, _FRESH_STEPS)]
         _publish(state, self._q, self._counts)
@@ -364,14 +367,14 @@ class Tick:
         self._counts = self._raw if calibration is None else calibration.counts
 
     def resume(self):
-        """Before the ticks go on after they were stopped: that time is not one of ticks that never came."""
+        """Call before stopped ticks go on: ticks of the pause are not counted as missed."""
         self._started = False
         self._coasted_ahead = 0
 
-    # -- for every program, interrupts and a second core included: nothing allocates
+    # -- for programs, interrupts and a second core: nothing here allocates
     @property
     def steps(self):
-        """Steps of the filter, ticks made up for not counted."""
+        """Steps of the filter, without missed ticks."""
         return self._state[_STEPS]
 
     @property
@@ -384,7 +387,7 @@ class Tick:
         """Copy what was published with the newest step into out, an array('i') of SNAPSHOT_WORDS: the words are named
         at the top of this file.
 
-        -> False when the tick never left it alone for long enough (then out is not to be used).
+        Returns False if steps kept cutting into the copy; then do not use out.
         """
         if len(out) < SNAPSHOT_WORDS:
             raise ValueError("a snapshot takes %d words" % SNAPSHOT_WORDS)
@@ -397,7 +400,8 @@ class Tick:
 
     @micropython.native
     def angles_into(self, out, order="zyx"):
-        """Roll, pitch, yaw of the newest step in millidegrees into out, an array('i') of 3 words or more; as snapshot.
+        """Roll, pitch, yaw of the newest step in millidegrees into out, an array('i') of 3 words or more. Returns as
+        snapshot() does.
 
         See fixmath.euler for the order.
         """
@@ -412,8 +416,8 @@ class Tick:
 
     @micropython.native
     def rates_into(self, out):
-        """Rates of turn of the newest step about body x, y, z, free of the filter's bias, in millidegrees per second,
-        into out[0..2]; as snapshot."""
+        """Angular rates of the newest step about body x, y, z, without the filter's bias, in millidegrees per second,
+        into out[0..2]. Returns as snapshot() does."""
         n = _TRIES
         while n > 0:
             sequence = self._state[_SEQUENCE]

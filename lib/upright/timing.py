@@ -1,5 +1,5 @@
-# The tick's clock: the best timer that the port has, or a chip's data-ready line; each says what it is.
-# Needs machine or pyb (no other module of the library imports them). Every port but those that PORTS lacks.
+# The tick's clock: the best timer of the port, or a chip's data-ready line. Each names itself in `what`.
+# Needs machine or pyb; no other module of the library imports them. Runs on the ports of PORTS.
 
 import sys
 
@@ -11,10 +11,10 @@ try:
 except ImportError:
     pyb = None
 
-# A timer may be off by as much as a crystal is; more would be a scale error of every angle.
+# A timer may be as inaccurate as a crystal; more would be a scale error of every angle.
 TOLERANCE_PPM = 100
 
-# What machine.Timer resolves on each port, by sys.platform, in 1/s. linux and darwin: the simulated machine.
+# Resolution of machine.Timer on each port, by sys.platform, in 1/s. linux and darwin: the simulated machine.
 PORTS = {
     "rp2": 1000000,
     "pyboard": 1000,
@@ -27,7 +27,7 @@ PORTS = {
     "linux": 1000000,
     "darwin": 1000000,
 }
-# pyb.Timers to take where nobody says which: 7 has no outputs, the others few; 5 is for servos, 6 for ADC and DAC.
+# Order in which pyb.Timers are tried: 7 has no outputs, the others few; 5 is for servos, 6 for ADC and DAC.
 _PYB_TIMERS = (7, 4, 10, 11, 13, 14, 12)
 _ESP32_TIMERS = (0, 1, 2, 3)
 
@@ -39,7 +39,7 @@ class Ticker:
 
     period_us  the period that the timer keeps, rounded to microseconds
     hard       True: the callback runs in the interrupt itself, with the heap locked
-    what       which timer it is, for people
+    what       the timer's name, for messages
     """
 
     def __init__(self, timer, period_us, hard, what, number=None):
@@ -79,11 +79,11 @@ class DataReady:
 def make_tick(rate, callback, timer=None):
     """Call `callback(timer)` at `rate` (Hz, or a tuple (num, den) Hz) -> Ticker.
 
-    timer  the number of the hardware timer: of pyb.Timer on stm32 (its callbacks are hard; machine.Timer's are soft
-           there), of machine.Timer on esp32; None: one that no other tick has
+    timer  the number of the hardware timer: of pyb.Timer on stm32 (its callbacks are hard, machine.Timer's are soft
+           there), of machine.Timer on esp32; None: a free one
 
-    Raises ValueError for a rate that the timer cannot keep within TOLERANCE_PPM, for a timer that another tick has,
-    and for a port of which this module knows no timer.
+    Raises ValueError for a rate that the timer cannot keep within TOLERANCE_PPM, for a timer that another tick uses,
+    and for a port that is not in PORTS.
     """
     if hasattr(micropython, "alloc_emergency_exception_buf"):  # built in on most boards
         micropython.alloc_emergency_exception_buf(

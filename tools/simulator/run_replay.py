@@ -95,7 +95,9 @@ def through_chip(config, world, rows):
             break
     filter.seed(counts)
     period_us = (2000000 * den + num) // (2 * num)
-    tick = ticks.Tick(imu, filter, period_us, follow=ticks.FOLLOW_CHIP, calibration=calibrated)
+    tick = ticks.Tick(
+        imu, filter, period_us, phase_gain_shift=ticks.PHASE_GAIN_SHIFT_CHIP, calibration=calibrated
+    )
     recorder = Recorder(config["out"], filter, rows)
 
     def after_tick():

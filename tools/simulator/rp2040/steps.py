@@ -102,7 +102,7 @@ filter = filters.make(%(filter)r, %(rate)r, imu, %(gains)r)
 time.sleep_ms(2)
 imu.read()
 filter.seed(imu.counts)
-tick = tick.Tick(imu, filter, %(period_us)d, follow=tick.FOLLOW_CHIP)
+tick = tick.Tick(imu, filter, %(period_us)d, phase_gain_shift=tick.PHASE_GAIN_SHIFT_CHIP)
 tell_places(tick)
 """
 )
