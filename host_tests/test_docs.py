@@ -9,6 +9,7 @@ import pytest
 import upright
 from chips.mpu6050 import MPU6050Chip
 from upright import reading
+from upright.mpu6050 import MPU6050
 from upright_host import cli, paths, runtimes
 from world import StillWorld
 
@@ -117,7 +118,7 @@ def test_the_functions_that_the_methods_name_are_in_the_files_beside_them(page):
 def test_every_call_and_every_word_of_the_status_is_on_the_page_of_the_face():
     page = (paths.ROOT / "docs/face.md").read_text()
     machine.wire_i2c(0, MPU6050Chip(StillWorld((0, 0, 4096))))
-    with upright.from_board(log=None, display=None) as imu:
+    with upright.AHRS(MPU6050(machine.I2C(0)), log=None) as imu:
         words = set(imu.status())
     calls = {call for kind in (type(imu), reading.Reading) for call in vars(kind)}
     calls |= {call for call in vars(upright) if callable(getattr(upright, call))}
