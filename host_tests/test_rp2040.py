@@ -85,7 +85,10 @@ def flight(image, files, motion):
     flight.seconds = (flight.board.now_us - began) / 1e6
     flight.ticks = len(flight.history)
     flight.reads = [t for t in flight.bus.log if t[2] == IMU and t[4] > 14 and t[0] > began]
-    flight.cuts, flight.whole = flight.bus.cuts, all(t[5] for t in flight.bus.log)
+    flight.cuts, flight.whole = (
+        flight.bus.cuts,
+        all(t[5] for t in flight.bus.log if t[2] in flight.bus.chips),
+    )
     return flight
 
 
