@@ -126,6 +126,10 @@ def pytest_collection_modifyitems(config, items):
     for item in items:
         if "recorded" in item.fixturenames:
             item.add_marker(pytest.mark.slow)
+        group = item.get_closest_marker("xdist_group")
+        if group and hasattr(config, "workerinput") and "@" not in item.nodeid:
+            # as --dist loadgroup wants it; xdist 3.8 leaves it out, and every worker would make a board of its own
+            item._nodeid = f"{item.nodeid}@{group.args[0]}"
 
 
 @pytest.fixture(scope="session")
