@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV = .venv/bin
 PARALLEL ?= auto
-PYTEST = $(VENV)/python -m pytest -n $(PARALLEL) --dist loadgroup --no-loadscope-reorder
+PYTEST = $(VENV)/python -m pytest -n $(PARALLEL) --no-loadscope-reorder
 CHECKED = cpython unix32
 space := $() $()
 comma := ,

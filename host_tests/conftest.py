@@ -126,10 +126,22 @@ def pytest_collection_modifyitems(config, items):
     for item in items:
         if "recorded" in item.fixturenames:
             item.add_marker(pytest.mark.slow)
-        group = item.get_closest_marker("xdist_group")
-        if group and hasattr(config, "workerinput") and "@" not in item.nodeid:
-            # as --dist loadgroup wants it; xdist 3.8 leaves it out, and every worker would make a board of its own
-            item._nodeid = f"{item.nodeid}@{group.args[0]}"
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Each file of the emulated board's tests to one worker, for they share boards; every other test by itself.
+
+    (xdist 3.8's groups do nothing with pytest 9.2, which keeps a test's id elsewhere.)
+    """
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Scheduling(LoadScopeScheduling):
+        def _split_scope(self, nodeid):
+            path = nodeid.partition("::")[0]
+            return path if "test_rp2040" in path else nodeid
+
+    return Scheduling(config, log)
 
 
 @pytest.fixture(scope="session")

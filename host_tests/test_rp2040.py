@@ -24,7 +24,7 @@ from upright_host import rp2040 as firmware
 from world import StillWorld, World
 
 # A firmware that is not there yet is built first, which takes minutes.
-pytestmark = [pytest.mark.xdist_group("rp2040"), pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
 IMU = 0x68
 PERIOD_US = 5000

@@ -19,7 +19,7 @@ from upright_host import (
     recordings,
 )
 
-pytestmark = [pytest.mark.xdist_group("rp2040_flash"), pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
 PICO = device.Facts("rp2", "Pico", (1, 26, 1), 6, 3, "armv6m", True, False, True, True, 0)
 OLD_SETTINGS = b"import no_such_module"  # what the older installation has: it would not start
