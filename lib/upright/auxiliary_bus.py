@@ -1,5 +1,5 @@
 # The auxiliary I2C bus of an MPU6050 or MPU6500: the chip's own master, on its pins AUX_CL and AUX_DA.
-# Needs registers.py; the configured driver of the chip is handed in. Runs on MicroPython >= 1.22
+# Needs registers.py; the configured driver of the chip is passed in. Runs on MicroPython >= 1.22
 # and under CPython with a `micropython` shim. RM is RM-MPU-6000A rev 4.2; RM-MPU-6500A has the same master.
 
 import time
@@ -9,7 +9,7 @@ from micropython import const
 
 from upright.registers import Registers, plain_name
 
-# What transact() answers in place of a byte
+# What transact() returns in place of a byte
 AUX_BUSY = const(-1)
 AUX_NACK = const(-2)  # no acknowledge
 AUX_TIMEOUT = const(-3)  # not carried out: the IMU asleep or reset, or the bus held low
@@ -49,7 +49,7 @@ _NOTHING = const(0)
 _ADDR = const(1)
 _REG = const(2)
 _DO = const(3)
-_CLEAR = const(4)  # I2C_MST_STATUS of what it tells of an earlier transaction
+_CLEAR = const(4)  # clear I2C_MST_STATUS of an earlier transaction
 _CTRL = const(5)
 _WAIT = const(6)
 
@@ -69,8 +69,8 @@ class AuxiliaryTimeout(AuxiliaryError):
 class AuxiliaryBus:
     """The auxiliary master of `imu`, a configured MPU6050 or MPU6500.
 
-    Slots 0 to 3 repeat themselves with the samples, what they read lies in EXT_SENS_DATA; slot 4 (SLV4)
-    does one byte once. begin() first, and again after each imu.configure().
+    Slots 0 to 3 repeat with the samples; what they read is in EXT_SENS_DATA. Slot 4 (SLV4) transfers one byte once.
+    Call begin() first, and again after each imu.configure().
 
         aux = AuxiliaryBus(imu)
         aux.begin()
@@ -79,9 +79,8 @@ class AuxiliaryBus:
         at = aux.periodic_read(0x0E, 0x02, 7)
         aux.start()
 
-    faults collects the bits of I2C_MST_STATUS that the chip itself forgets when they are read: NACK of
-    slots 0 to 3 in bits 0 to 3, of SLV4 in bit 4, arbitration lost in bit 5. Whoever has seen them sets
-    faults to 0.
+    faults collects the bits of I2C_MST_STATUS, which the chip clears when they are read: NACK of slots 0 to 3 in bits 0
+    to 3, of SLV4 in bit 4, arbitration lost in bit 5. Set faults to 0 after reading it.
 
     Slots and I2C_MST_DLY are rows of imu's register table: after a reset of the chip imu.health()
     brings them back.
@@ -92,12 +91,12 @@ class AuxiliaryBus:
         self.faults = 0
         self._byte = bytearray(1)
         self._slots = []  # (address, register, length, value or None, delayed)
-        self._used = 0  # slots that imu's table has rows for
+        self._used = 0  # slots that have rows in imu's table
         self._every = 1
         self._delay = 0  # I2C_MST_DLY
         self._step = _NOTHING
         self._words = bytearray(3)  # of the transaction: for SLV4_ADDR, SLV4_REG, SLV4_DO
-        self._known = -1  # what SLV4_ADDR holds; -1: not known, and I2C_MST_STATUS is to be cleared
+        self._known = -1  # contents of SLV4_ADDR; -1: unknown, and I2C_MST_STATUS must be cleared
         self._left = 0
         self._imu_resets = 0
 
@@ -105,18 +104,18 @@ class AuxiliaryBus:
 
     @property
     def running(self):
-        """True once begin() is through, and until imu.configure()."""
+        """True after begin(), until imu.configure()."""
         return self.imu.master_enabled
 
     def begin(self):
-        """Switch the master on: 400 kHz, no slot in use. A running one goes on, without its slots.
+        """Switch the master on: 400 kHz, no slot in use. A running master goes on, without its slots.
 
         Not WAIT_FOR_ES: it would hold back the IMU's own data-ready for a dead magnetometer.
-        DELAY_ES_SHADOW: the bytes of one round appear in EXT_SENS_DATA together.
+        DELAY_ES_SHADOW: all bytes of one sample appear in EXT_SENS_DATA together.
         """
         running = (
             self.running
-        )  # then it may be in the middle of a transfer: only the slots are switched off
+        )  # it may be in the middle of a transfer: only the slots are switched off
         rows = [] if running else [(_I2C_MST_CTRL, _P_NSR | _CLOCK_400_KHZ, 0xFF)]
         if running:
             rows += [(_SLV0_CTRL + 3 * n, 0, 0xFF) for n in range(self._used)]
@@ -139,9 +138,9 @@ class AuxiliaryBus:
     def periodic_read(self, address, register, length, every=1):
         """Read 1 to 15 bytes with every sample, or every 2nd to 32nd; returns their place.
 
-        The place counts from EXT_SENS_DATA_00: the slots' bytes lie there one after the other. Takes
-        effect with start(). Raises ValueError when slots or bytes are used up, or for another `every`
-        than a slot has already: there is one divider for all.
+        The place counts from EXT_SENS_DATA_00, where the slots' bytes follow each other. It takes effect with start().
+        Raises ValueError when slots or bytes are used up, or for a second value of `every`: all slots share one
+        divider.
         """
         if not 1 <= length <= _LONGEST:
             raise ValueError(f"length {length!r} is not 1 to {_LONGEST}")
@@ -158,8 +157,8 @@ class AuxiliaryBus:
     def start(self):
         """Program the slots while all are disabled, then enable them.
 
-        The chip lays out EXT_SENS_DATA anew only when all slots are disabled (RM 4.20). Raises
-        ValueError when the transactions take longer than a sample (RM 4.8).
+        The chip assigns EXT_SENS_DATA anew only when all slots are disabled (RM 4.20). Raises ValueError when the
+        transactions take longer than a sample (RM 4.8).
         """
         self._need_begun()
         num, den = self.imu.sample_rate
@@ -212,7 +211,7 @@ class AuxiliaryBus:
             raise AuxiliaryError("auxiliary bus: begin() first")
 
     def transfer(self, address, register, data):
-        """transact() until it is done; takes up to a sample. Raises AuxiliaryNack and AuxiliaryTimeout."""
+        """Call transact() until it is done, up to a sample. Raises AuxiliaryNack and AuxiliaryTimeout."""
         self._need_begun()
         num, den = self.imu.sample_rate
         most = 5000 + 3_000_000 * den // num  # SLV4 has its turn once a sample
@@ -224,12 +223,10 @@ class AuxiliaryBus:
             outcome = self.transact(address, register, data)
             if outcome != AUX_BUSY:
                 break
-            if (
-                self._step != _WAIT
-            ):  # not on its way yet: where the IMU does not answer, it has 16 calls
+            if self._step != _WAIT:  # not started yet: if the IMU does not answer, it has 16 calls
                 start = time.ticks_us()
                 continue
-            self._left = 0 if late else _CALLS  # 0: the next call gives it up
+            self._left = 0 if late else _CALLS  # 0: the next call gives up
             time.sleep_us(50)
         lost = self.faults & _LOST_ARB
         self.faults |= earlier
@@ -252,15 +249,15 @@ class AuxiliaryBus:
     def transact(self, address, register, data):
         """Write data to a register of a device or, with bit 7 of address set, read one (data is then 0).
 
-        To be called with the same arguments until the answer is not AUX_BUSY: then it is the byte that was read, 0 for
-        a write, or an AUX_ state. At most two registers of the IMU a call. A read takes 2 or 3 calls, a write 3, as
-        long as there is a sample between two of them; after 16 calls it is given up.
+        Call it with the same arguments until it no longer returns AUX_BUSY. Then it returns the byte that was read, 0
+        for a write, or an AUX_ state. A call accesses at most two registers of the IMU. A read takes 2 or 3 calls, a
+        write 3, if there is a sample between two calls. After 16 calls it gives up.
         """
         words = self._words
         step = self._step
         if step == _NOTHING or words[0] != address or words[1] != register or words[2] != data:
             if step == _WAIT:
-                self._known = -1  # the one before was not waited for
+                self._known = -1  # the transaction before was not completed
             words[0] = address
             words[1] = register
             words[2] = data
@@ -270,7 +267,7 @@ class AuxiliaryBus:
         if resets != self._imu_resets:
             self._imu_resets = resets
             self._known = -1
-            self._step = _ADDR  # the chip has forgotten it
+            self._step = _ADDR  # the chip has lost it
         self._left -= 1
         if self._left < 0:
             self._step = _NOTHING
@@ -286,10 +283,12 @@ class AuxiliaryBus:
 
     @micropython.native
     def _advance(self):
-        """One register of SLV4, in the order in which the chip wants them; after a fault once more."""
+        """Write one register of SLV4, in the order that the chip needs; after a fault once more."""
         step = self._step
         if step == _CTRL:
-            if self._write(_SLV4_CTRL, _ENABLE | self._delay):  # EN beside the delay, never without
+            if self._write(
+                _SLV4_CTRL, _ENABLE | self._delay
+            ):  # EN and the delay share this register
                 self._step = _WAIT
         elif step == _CLEAR:
             if self._read(_I2C_MST_STATUS):
@@ -349,11 +348,11 @@ class AuxiliaryBus:
 
 
 class AuxiliaryDevice(Registers):
-    """One device on the auxiliary bus: for set-up what registers.py offers on every bus, a byte at a time, each within
-    a sample; for the tick transact(). errors counts the transactions after which some device on the bus had not
+    """One device on the auxiliary bus. For set-up it has the methods of registers.py, a byte at a time, each within a
+    sample; for the tick it has transact(). errors counts the transactions after which some device on the bus had not
     acknowledged."""
 
-    own_bus = False  # what it measures comes with the IMU's samples
+    own_bus = False  # its measurements come with the IMU's samples
 
     def __init__(self, bus, address, error_class, name):
         Registers.__init__(self, error_class, name)
@@ -381,16 +380,16 @@ class AuxiliaryDevice(Registers):
             self.write(buffer[0] + i - 1, buffer[i])
 
     def begin(self):
-        """Let the bus work, with no slot in use."""
+        """Start the bus, with no slot in use."""
         self._bus.imu.attach(None, 0)
         self._bus.begin()
 
     def attach(self, ext, register, length, trigger, value, every):
-        """Read `length` bytes from register on with every sample, write value to trigger with every n-th, and hand
-        the bytes on to ext as imu.attach() says. Takes all slots."""
+        """Read `length` bytes from register on with every sample, write value to trigger with every n-th, and pass
+        the bytes to ext as imu.attach() says. It uses all slots."""
         bus = self._bus
         self.begin()
-        bus.periodic_read(self.address, register, length)  # at 0: nothing else is there
+        bus.periodic_read(self.address, register, length)  # at 0: no other slot is in use
         bus.periodic_write(self.address, trigger, value, every)
         bus.start()
         bus.faults = 0
@@ -398,7 +397,7 @@ class AuxiliaryDevice(Registers):
 
     @micropython.native
     def transact(self, register, data):
-        """As the bus has it; data -1: a read."""
+        """transact() of the bus; data -1: a read."""
         bus = self._bus
         if data < 0:
             outcome = bus.transact(self.address | _READ, register, 0)

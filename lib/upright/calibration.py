@@ -1,7 +1,6 @@
 # Calibration of counts: offset, matrix and axis map for every sample, and the file that keeps them.
-# Needs the viper emitter (apply) and json, binascii.crc32, os (the file). apply() is made for a hard
-# interrupt: it allocates nothing, raises nothing and uses no float. docs/calibration.md has the
-# formula and the file's format.
+# Needs the viper emitter, json, binascii.crc32 and os. apply() may run in a hard interrupt: it allocates nothing,
+# raises nothing and uses no float. docs/calibration.md has the formula and the file's format.
 #
 # All set-up is in integers, so that a board with single-precision floats gets the same bits.
 
@@ -16,7 +15,7 @@ from micropython import const
 FORMAT = "upright-calibration"
 VERSION = 1
 
-_NEW = ".new"  # what a file is called until it is whole
+_NEW = ".new"  # suffix of a file until it is complete
 _ENOENT = const(2)
 _EEXIST = const(17)
 _SIZE_MAX = const(2048)  # bytes; a real one has about 400
@@ -29,13 +28,13 @@ _BIAS_MOST = const(60000000)
 _ACCEL_OFFSET_MOST = const(500000)  # ug
 _MAG_OFFSET_MOST = const(20000000)  # 1/1000 count
 _ROW_MOST = const(2000000)  # ppm: sum of the magnitudes in a row of a matrix
-# ppm: a matrix of a smaller determinant would invent what was not measured
+# ppm: with a smaller determinant the matrix would amplify noise
 _DET_LEAST = const(50000)
 
 _UNIT = (1000000, 0, 0, 0, 1000000, 0, 0, 0, 1000000)
 _ROWS = ((1000000, 0, 0), (0, 1000000, 0), (0, 0, 1000000))
 _UP_LEAST = const(707107)  # cos 45 deg: the tilt of a trim
-_OPTIONAL = ("up_ppm",)  # fields that a file has only where they are at work
+_OPTIONAL = ("up_ppm",)  # fields that a file may leave out
 _ZERO = (0, 0, 0)
 
 # the words of apply()
@@ -43,10 +42,10 @@ _PROBE = const(0)  # always -1: ptr32 zero-extends where a word is 64 bits, see 
 # accelerometer, gyro, magnetometer: 3 rows of a matrix with axis map and trim, 3 words Q14; constant, Q14, 8192 for
 # rounding
 _M = const(1)
-_GYRO = const(37)  # 3 times the word that body x, y, z come from, and 1 where its sign is turned
+_GYRO = const(37)  # 3 times the word of body x, y, z, and 1 if its sign is turned
 _STRIDE = const(
     43
-)  # 3 where a trim wants the gyro's matrix, else 6: the gyro's words are only put in their places
+)  # 3 with a trim, which needs the gyro's matrix; else 6: the gyro's words are only reordered
 _WORDS = const(44)
 
 
@@ -55,9 +54,9 @@ class CalibrationError(ValueError):
 
     kind   "missing": no such file; "corrupt": not a whole file, or a value that cannot be right;
            "foreign": another format or version, or made for another chip or board
-    title  the same for a small display, at most 16 characters
+    title  a short form for a small display, at most 16 characters
 
-    The text says which file, what was expected and what was found.
+    The message names the file, what was expected and what was found.
     """
 
     _TITLES = {
@@ -73,26 +72,25 @@ class CalibrationError(ValueError):
 
 
 class Calibration:
-    """Turns a driver's counts, in the chip's frames, into calibrated counts in the body's frame.
+    """Turns a driver's counts, in the chip's frames, into calibrated counts in the body frame.
 
         counts = axis map (matrix (raw - offset)), rounded, saturated at int16
 
-    for the accelerometer and for the magnetometer; the gyro gets its axis map alone, as its bias
-    belongs into the filter, which takes it finer than a count: see gyro_bias(). A trim, for a
-    mounting that is tilted, turns the body's frame of all three: see set_level().
+    for the accelerometer and the magnetometer. The gyro gets its axis map only: its bias goes into the filter, which
+    takes it in 1/256 count, see gyro_bias(). The trim of a tilted mounting turns the body frame of all three, see
+    set_level().
 
     imu_axes         body x, y, z (forward, left, up) as axes of the IMU: "x", "-y", ...
-    mag_axes         the same for the magnetometer; this one may mirror, for there are
-                     magnetometers with a left-handed frame
+    mag_axes         the same for the magnetometer; it may mirror, because some magnetometers have a left-handed frame
     accel_lsb_per_g  int, 64..32767
     gyro_scale       (num, den): LSB per deg/s
 
     counts    array('h') of 11 words ax ay az gx gy gz mx my mz temp flags: what the filter gets
-    identity  True while apply() would only copy
-    fields    what a file of it would hold, see check()
+    identity  True if apply() would only copy
+    fields    the contents of its file, see check()
 
-    Made without corrections: only the axis maps are at work until load() or set(). Raises ValueError
-    for axes that are not three different ones, an IMU map that mirrors, and scales out of range.
+    A new object has no corrections: only the axis maps are applied until load() or set(). Raises ValueError for axes
+    that are not three different ones, an IMU map that mirrors, and scales out of range.
     """
 
     def __init__(
@@ -126,8 +124,8 @@ class Calibration:
     def apply(self, raw):
         """Calibrate one sample, array('h') of 11 words in the chips' frames, into counts.
 
-        Flags (word 10) and temperature are copied. Accelerometer and gyro are taken over when bit 0
-        of the flags is set, the magnetometer when bit 1 is; what is not fresh stays as it was.
+        Flags (word 10) and temperature are copied. Accelerometer and gyro are calibrated if bit 0 of the flags is set,
+        the magnetometer if bit 1 is set. Other words keep their values.
         """
         r = ptr16(raw)
         out = ptr16(self.counts)
@@ -174,17 +172,17 @@ class Calibration:
 
     # -- set-up: allocates
     def load(self, path, chip=None, board=None):
-        """Take the corrections of a file, made for this chip and board (None: any).
+        """Load the corrections from a file that was made for this chip and board (None: any).
 
-        Raises CalibrationError; then there are no corrections, only the axis maps.
+        Raises CalibrationError; then only the axis maps are applied.
         """
         self._use(blank())
         self._use(read(path, chip, board))
 
     def set(self, fields):
-        """Take corrections: a dict as of check(), which may leave out what there is none of.
+        """Use corrections: a dict as in check(). Absent keys mean no correction.
 
-        Raises CalibrationError; then there are no corrections, only the axis maps.
+        Raises CalibrationError; then only the axis maps are applied.
         """
         self._use(blank())
         whole = blank()
@@ -193,7 +191,7 @@ class Calibration:
         self._use(whole)
 
     def save(self, path, chip=None, board=None):
-        """Write the corrections to a file, for this chip and board where they are given; see write()."""
+        """Write the corrections to a file, for this chip and board if they are given; see write()."""
         fields = dict(self.fields)
         if chip is not None:
             fields["chip"] = chip
@@ -203,7 +201,7 @@ class Calibration:
         self.fields = fields
 
     def gyro_bias(self):
-        """The gyro's bias in the body's frame, 3 ints in 1/256 count for a filter's set_bias, or None."""
+        """The gyro's bias in the body frame, 3 ints in 1/256 count for a filter's set_bias, or None."""
         bias = self.fields["gyro_bias_udps"]
         if bias is None:
             return None
@@ -213,11 +211,10 @@ class Calibration:
         return tuple([_round(b * 256 * num, 1000000 * den) for b in body])
 
     def save_gyro_bias(self, path, x, y, z, chip=None, board=None):
-        """Put a new gyro bias, in 1/256 count in the body's frame, into a file; the rest of it stays.
+        """Store a new gyro bias, in 1/256 count in the body frame, in a file. The rest of the file stays.
 
-        A file that is missing is begun. Raises CalibrationError for one that is corrupt or foreign
-        and for a bias beyond 60 deg/s, OSError when it cannot be written; then the file is as it
-        was.
+        A missing file is created. Raises CalibrationError for a corrupt or foreign file and for a bias beyond 60 deg/s,
+        OSError when it cannot be written. Then the file is unchanged.
         """
         num, den = self.gyro_scale
         bias = [0, 0, 0]
@@ -229,10 +226,10 @@ class Calibration:
         self.fields["gyro_bias_udps"] = bias
 
     def set_level(self, up):
-        """Trim: from now on the body is level when it lies as it does now.
+        """Trim: make the present position level.
 
-        up: where up is then, 3 ints, 1e-6 of a unit vector, in the frame of the axis map without a
-        trim. Raises CalibrationError beyond 45 degrees, which is a case for the axis map.
+        up: the direction of up in that position, 3 ints, 1e-6 of a unit vector, in the frame of the axis map without a
+        trim. Raises CalibrationError beyond 45 degrees: change the axis map then.
         """
         fields = dict(self.fields)
         fields["up_ppm"] = list(up)
@@ -240,7 +237,7 @@ class Calibration:
         self._use(fields)
 
     def save_level(self, path, chip=None, board=None):
-        """Put the trim into a file; otherwise as save_gyro_bias()."""
+        """Store the trim in a file, like save_gyro_bias()."""
         _put(path, "up_ppm", self.fields["up_ppm"], chip, board)
 
     def _use(self, fields):
@@ -274,7 +271,7 @@ class Calibration:
 
 # ------------------------------------------------------------------------------------------ the file
 def blank(chip=None, board=None):
-    """The fields of a calibration that corrects nothing."""
+    """The fields of a calibration without corrections."""
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -290,7 +287,7 @@ def check(fields, where="calibration"):
     """Raise CalibrationError unless `fields` is a dict of a calibration, without its checksum:
 
     format, version  FORMAT and VERSION
-    chip, board      names, or None where it does not matter
+    chip, board      names, or None for any
     gyro_bias_udps   3 ints, 1e-6 deg/s, each within +-60 deg/s; or None
     accel            {"offset_ug": 3 ints, 1e-6 g, within +-0.5 g; "matrix_ppm": 9 ints, row by row};
                      or None
@@ -298,17 +295,17 @@ def check(fields, where="calibration"):
     up_ppm           the trim, absent without one: 3 ints, 1e-6, the unit vector that points up when the
                      body is level, within 45 degrees of z, in the frame of the axis map
 
-    the others in the chip's own frame. The magnitudes in a row of a matrix add up to 2 at the most, and its
-    determinant is 0.05 at least.
+    All but up_ppm are in the chip's own frame. The magnitudes in a row of a matrix add up to 2 at most, and its
+    determinant is 0.05 or more.
     """
     _check_shape(fields, where)
     _check_bounds(fields, where)
 
 
 def read(path, chip=None, board=None):
-    """The fields of a calibration file that is made for this chip and board (None: any).
+    """Read the fields of a calibration file that was made for this chip and board (None: any).
 
-    Where the power failed while a file was replaced, the new one is found under its first name.
+    If the power failed while the file was replaced, this reads the new file under its temporary name.
     Raises CalibrationError.
     """
     try:
@@ -333,12 +330,12 @@ def read(path, chip=None, board=None):
 def write(path, fields):
     """Write the fields as a calibration file, replacing one that is there.
 
-    Whenever the power fails, read() finds the old file or the new one. Raises CalibrationError for
-    fields that read() would refuse, OSError when it cannot be written.
+    After a power failure read() finds the old file or the new one. Raises CalibrationError for fields that read()
+    would refuse, OSError when the file cannot be written.
     """
     check(fields)
     body = _text(fields)
-    # Only the new name left, from a replacement that was cut off: it must not be overwritten
+    # An interrupted replacement has left only the new file: it must not be overwritten
     if not _exists(path) and _interrupted(path) is not None:
         os.rename(path + _NEW, path)
     with open(path + _NEW, "wb") as file:
@@ -354,12 +351,12 @@ def write(path, fields):
     except OSError as why:
         if why.errno != _EEXIST:
             raise
-        os.remove(path)  # a file system, like FAT, that replaces nothing
+        os.remove(path)  # a file system, like FAT, that cannot replace a file
         os.rename(path + _NEW, path)
 
 
 def _put(path, name, value, chip, board):
-    """Write one field of a file; the rest stays. A file that is missing is begun."""
+    """Write one field of a file; the rest stays. A missing file is created."""
     try:
         fields = read(path, chip, board)
     except CalibrationError as why:
@@ -384,7 +381,7 @@ def _contents(path):
 
 
 def _interrupted(path):
-    """The fields of a whole file that did not get its last name, or None."""
+    """The fields of a complete file that still has its temporary name, or None."""
     try:
         return _parse(path + _NEW, _contents(path + _NEW))
     except (OSError, CalibrationError):
@@ -585,8 +582,8 @@ def _dot(row, vector, den):
 def _fold(s, at, trim, axes, matrix_ppm, offset, num, den):
     """12 words at s[at]: for each body axis a row of the matrix in Q14, and -row . offset.
 
-    offset * num / den are counts. The constant belongs to the rounded row, so that a raw value near
-    the offset comes out right whatever the rounding.
+    offset * num / den are counts. The constant is computed with the rounded row, so a raw value near the offset is
+    exact whatever the rounding.
     """
     for i in range(3):
         c = 0

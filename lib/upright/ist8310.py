@@ -18,7 +18,7 @@ _IDENTITY = const(0x10)
 _SINGLE = const(0x01)  # CNTL1: measure once, then back to standby
 _SRST = const(0x01)  # CNTL2: soft reset, clears itself
 _DREN_DRP = const(0x0C)  # CNTL2: without DREN the DRDY bit stays 0 as well as the pin (DS 6.4)
-_PULSE_NORMAL = const(0xC0)  # PDCNTL: what DS 3.1.1 asks for
+_PULSE_NORMAL = const(0xC0)  # PDCNTL: required by DS 3.1.1
 _DRDY = const(0x01)
 _STAT1_RESERVED = const(0xFC)
 
@@ -58,8 +58,8 @@ class IST8310(Magnetometer):
         mag = IST8310(AuxiliaryBus(imu))
         mag.configure(rate_hz=100)
 
-    From then on imu.read() or imu.fifo_next() fills counts[6..8] as well, and imu.health() looks after the
-    magnetometer. To be done again after imu.configure(). On a bus of its own it is read by itself:
+    From then on imu.read() or imu.fifo_next() also fills counts[6..8], and imu.health() checks the magnetometer. Do
+    this again after imu.configure(). On a bus of its own the magnetometer is read by itself:
 
         mag = IST8310(i2c)
         mag.configure(rate_hz=100, sample_rate=200)
@@ -69,7 +69,7 @@ class IST8310(Magnetometer):
             mag.read(imu.counts)
 
     address is 0x0C to 0x0F by the pins CAD0 and CAD1, 0x0E when they are open. The frame is left-handed. A measurement
-    takes 5 ms, from an average of 8 on 6 ms. The rest is as Magnetometer has it.
+    takes 5 ms, and 6 ms with an average of 8 or 16. Magnetometer describes the rest.
     """
 
     chip = "IST8310"
@@ -98,10 +98,9 @@ class IST8310(Magnetometer):
     def take(self, raw: ptr8, at: int, counts: ptr16) -> int:
         """Unpack STAT1 and data at raw[at..at+6]: a new measurement goes to counts[6..8].
 
-        Returns 2 then, else 0. New is what carries DRDY (reading the data clears it, DS 6.4), unless
-        the bytes were there with the sample before already: a master that gets no answer leaves them.
-        A measurement that ends while it is being read may lose its DRDY; then it is known by data that
-        are other than the last ones and have stayed for two samples.
+        Returns 2 then, else 0. A measurement is new if it has DRDY (reading the data clears it, DS 6.4), unless the
+        bytes equal those of the sample before: a master that gets no answer keeps them. A measurement that ends during
+        a read may lose its DRDY. It is recognised by data that differ from the last ones and stay for two samples.
         """
         state = ptr32(self._state)
         kept = ptr8(self._kept)

@@ -1,5 +1,5 @@
 # What the drivers of magnetometers share: one chip behind an IMU's auxiliary bus or on a bus of its own, its rate, and
-# the watch over its registers. Needs registers.py, and auxiliary_bus.py for a chip behind an IMU. Runs on
+# the check of its registers. Needs registers.py, and auxiliary_bus.py for a chip behind an IMU. Runs on
 # MicroPython >= 1.22 and under CPython with a `micropython` shim. A driver is a subclass, as in ist8310.py.
 
 import time
@@ -13,7 +13,7 @@ from upright.registers import I2CRegisters
 _MAG_FRESH = const(2)
 _COUNT_MASK = const(0x3FFFFFFF)
 
-_BUSY = const(-1)  # what transact() answers, as in auxiliary_bus.py
+_BUSY = const(-1)  # what transact() returns, as in auxiliary_bus.py
 _NACK = const(-2)
 
 # Words of the state. The subclass's take() keeps those from _FRESH to _Z.
@@ -25,20 +25,20 @@ _STEP = const(4)
 _LEFT = const(5)  # samples until the next measurement is overdue
 _LIMIT = const(6)
 _N = const(7)  # samples from one measurement to the next
-_WAS_READY = const(8)  # the status said so with the sample before
+_WAS_READY = const(8)  # the status of the sample before was ready
 _X = const(9)  # the newest measurement
 # and those of read():
-_DUE = const(12)  # calls after which a measurement may be through; 0 behind an IMU
+_DUE = const(12)  # calls after which a measurement may be ready; 0 behind an IMU
 _AGE = const(13)  # calls since the last one was started
 _WAITING = const(14)  # 1: it has not come yet
 _WORDS = const(15)
 
-# _STEP: what the look at a register is for. Only in _WATCH measurements are delivered.
+# _STEP: what the next access to a register is for. Measurements are delivered in _WATCH only.
 _ABSENT = const(0)  # does it answer?
-_CHECK = const(1)  # it has answered: does it still have its registers?
-_REPAIR = const(2)  # a register was wrong: read each again
-_WRITE = const(3)  # and this one is being written
-_WATCH = const(4)  # all are as they should be
+_CHECK = const(1)  # it has answered: are its registers still correct?
+_REPAIR = const(2)  # a register was wrong: read all again
+_WRITE = const(3)  # this register is being written
+_WATCH = const(4)  # all registers are correct
 
 _MARGIN_PERCENT = const(2)  # both chips' clocks
 
@@ -90,21 +90,21 @@ class OwnBus:
 
 
 class Magnetometer:
-    """The driver of one chip without what is that chip's own.
+    """What the drivers of all magnetometer chips share.
 
-    bus      AuxiliaryBus of a configured IMU, which then gives all of its slots; or an I2C bus (has
+    bus      AuxiliaryBus of a configured IMU, whose slots are all used then; or an I2C bus (has
              readfrom_mem_into and writeto), or the chip's I2CRegisters
     address  on that bus
 
-    own_bus says which: False: imu.read() or imu.fifo_next() fills counts[6..8] and sets bit 1 of the flags with each
-    new measurement, and imu.health() looks after the chip. True: read() does both and is to be called once a sample.
-    The frame is the chip's own.
+    own_bus False: imu.read() or imu.fifo_next() fills counts[6..8] and sets bit 1 of the flags with each new
+    measurement, and imu.health() checks the chip. own_bus True: read() does both; call it once a sample. The frame is
+    the chip's own.
 
-    Counters, wrapping at 2**30: fresh, stale, saturated, unflagged, errors (behind an IMU: looks that found a missing
-    acknowledge; else faults of the bus), resets (times that its registers had to be written). present: it answered
-    when last asked.
+    Counters, wrapping at 2**30: fresh, stale, saturated, unflagged, errors (behind an IMU: checks that found a missing
+    acknowledge; else faults of the bus), resets (how often its registers had to be written). present: it answered the
+    last access.
 
-    A subclass brings
+    A subclass defines
 
         chip, error_class   the name, and the class of its exceptions, an OSError
         lsb_per_uT          (num, den)
@@ -114,8 +114,8 @@ class Magnetometer:
         RESET               (register, bit) of the soft reset; the bit clears itself
         RESET_MS            the longest time until it answers after that, or after power-on
         HINT                what to check when nothing answers
-        registers_for(average)   rows (register, value, mask) that make up its configuration; the first is its
-                                 identity, which the reset brings back
+        registers_for(average)   rows (register, value, mask) of its configuration; the first is its identity,
+                                 which a reset restores
         take(raw, at, counts)    unpack the bytes of SAMPLE at raw[at]; returns 2 for a new measurement, else 0
     """
 
@@ -136,7 +136,7 @@ class Magnetometer:
         self._registers.error_class = self.error_class
         self._registers.name = self._name
         self._state = array("i", [0] * _WORDS)
-        # for take(): the data that were used last, and those of the sample before
+        # for take(): the data that were used last, and the data of the sample before
         self._kept = bytearray(12)
         self._set_rows(max(self.AVERAGES))
         self._start, self._start_value = self.START
@@ -145,25 +145,24 @@ class Magnetometer:
         self.resets = 0
         self.sample_rate = None
         self._row = 0
-        self._unseen = 0  # rows that have yet to be seen right
+        self._unseen = 0  # rows that have not been read as correct yet
         self._misses = 0
 
     # Set-up: may wait, allocate and raise
 
     def configure(self, rate_hz=100, average=None, sample_rate=None):
-        """Find the magnetometer, reset and configure it, and let it measure.
+        """Find the magnetometer, reset and configure it, and start it.
 
-        rate_hz      measurements per second at the most, int or (num, den)
-        average      readings to a measurement, one of AVERAGES; None: the most
+        rate_hz      measurements per second at most, int or (num, den)
+        average      readings to a measurement, one of AVERAGES; None: the largest
         sample_rate  how often it is read, int Hz or (num, den); None: the IMU's sample rate (without an
                      IMU 1000 Hz)
 
-        A measurement falls on every n-th sample, n being 2 to 32; afterwards sample_rate is what this gives,
+        There is a measurement with every n-th sample, n = 2 to 32. Afterwards sample_rate is the resulting rate,
         (num, den) Hz.
 
-        Raises ValueError for a rate that the chip, or n, cannot do, and error_class when the chip is
-        absent or does not keep what is written to it. After that attach() is worth while all the same:
-        a magnetometer that turns up later is found and configured in the tick.
+        Raises ValueError for a rate that is not possible, and error_class when the chip is absent or does not keep
+        what is written to it. Call attach() also then: the tick finds and configures a magnetometer that answers later.
         """
         self._plan(rate_hz, average, sample_rate)
         self.begin()
@@ -177,15 +176,15 @@ class Magnetometer:
         identity, right, _ = self._rows[0]
         who = self._await(identity)
         if who != right:
-            # it can be written, and so be spoilt by noise, even across a short loss of supply; a soft reset
-            # mends it (seen by ArduPilot)
+            # the identity is writable: noise or a short loss of supply can change it, and a soft reset restores it
+            # (seen by ArduPilot)
             try:
                 self._reset()
             except OSError:
                 pass  # of another chip
             who = self._await(identity)
         stuck = who == right and self._reset()
-        if stuck:  # or is it another chip, that showed this by chance?
+        if stuck:  # or is it another chip, which showed this by chance?
             who = self._await(identity)
         if who != right:
             raise self.error_class(
@@ -201,7 +200,7 @@ class Magnetometer:
             self._registers.verify_register(register, value, mask)
 
     def attach(self):
-        """Let the tick read it, and look for it where configure() did not find it."""
+        """Let the tick read the chip, and search for it if configure() did not find it."""
         if self.sample_rate is None:
             self._plan(100, None, None)
         state = self._state
@@ -227,7 +226,7 @@ class Magnetometer:
             sample_rate = self._link.sample_rate
         num, den = _ratio("sample_rate", sample_rate)
         rate_num, rate_den = _ratio("rate_hz", rate_hz)
-        # At least 2, for DRDY shows a new measurement by going away in between
+        # At least 2: DRDY must go away between two measurements
         n = max(2, -(-num * rate_den // (den * rate_num)))
         least = self.AVERAGES[average] * (100 + _MARGIN_PERCENT)  # us, times 100
         if n * den * 100_000_000 < least * num:
@@ -256,18 +255,18 @@ class Magnetometer:
         self._numbers = bytes(row[0] for row in rows)
         self._values = bytes(row[1] for row in rows)
         self._masks = bytes(row[2] for row in rows)
-        # what is written to mend a row; the identity by a reset
+        # what is written to correct a row; the identity needs a reset
         self._mend_numbers = bytes(self.RESET[:1]) + self._numbers[1:]
         self._mend_values = bytes(self.RESET[1:]) + self._values[1:]
 
     def _reset(self):
-        """Soft reset, waited for by its own bit; returns the bit."""
+        """Soft reset; waits until its bit clears, and returns the bit."""
         register, bit = self.RESET
         self._registers.write_register(register, bit)
         return self._await(register, bit) & bit
 
     def _await(self, register, busy=0):
-        """Read a register until it answers and its busy bits are clear, RESET_MS at the most."""
+        """Read a register until it answers and its busy bits are clear, RESET_MS at most."""
         byte = bytearray(1)
         start = time.ticks_ms()
         while True:
@@ -295,50 +294,51 @@ class Magnetometer:
         num, den = self.lsb_per_uT
         state = self._state
         before = None
-        while before != state[_FRESH]:  # a tick may come in between
+        while before != state[_FRESH]:  # a tick may cut in
             before = state[_FRESH]
             x, y, z = state[_X], state[_X + 1], state[_X + 2]
         return (x * den / num, y * den / num, z * den / num) if before else None
 
     @property
     def present(self):
-        """It answered when last asked."""
+        """Whether it answered the last access."""
         return self._state[_STEP] != _ABSENT
 
     @property
     def errors(self):
-        """Behind an IMU: looks that found a missing acknowledge. On a bus of its own: faults of the bus."""
+        """Behind an IMU: checks that found a missing acknowledge. On a bus of its own: faults of the bus."""
         return self._link.errors
 
     @property
     def fresh(self):
-        """Measurements that were delivered."""
+        """Number of delivered measurements."""
         return self._state[_FRESH]
 
     @property
     def stale(self):
-        """Times that a measurement was overdue: more than two samples late, then once for each missing."""
+        """Number of overdue measurements: more than two samples late, then once for each further one."""
         return self._state[_STALE]
 
     @property
     def saturated(self):
-        """Measurements that were withheld, an axis being beyond its range."""
+        """Number of withheld measurements: an axis was out of range."""
         return self._state[_SATURATED]
 
     @property
     def unflagged(self):
-        """Measurements that were recognised by their data, the chip's own flag having gone by unseen."""
+        """Number of measurements recognised by their data, because the chip's flag was lost."""
         return self._state[_UNFLAGGED]
 
     # The tick: nothing below allocates, waits, raises or uses a float.
 
     @micropython.native
     def read(self, counts):
-        """On a bus of its own, to be called once a sample: fills counts[6..8] and sets bit 1 of counts[10] with each
-        new measurement; returns counts[10]. Behind an IMU, whose samples bring that, it does nothing.
+        """On a bus of its own, call this once a sample: it fills counts[6..8] and sets bit 1 of counts[10] with each
+        new measurement, and returns counts[10]. Behind an IMU it does nothing: the IMU's samples bring the
+        measurements.
 
-        At most two transfers a call: status and data once the measurement may be through, the start of the
-        next, and in between one register of the configuration.
+        At most two transfers a call: status and data when the measurement may be ready, the start of the next one, and
+        between them one register of the configuration.
         """
         flags = counts[10]
         state = self._state
@@ -372,10 +372,10 @@ class Magnetometer:
 
     @micropython.native
     def health(self):
-        """Look after the chip's registers; returns present.
+        """Check the chip's registers; returns present.
 
-        Each is read in turn and written when it is not as it should be, then read again; after that no measurement
-        is delivered until all have been seen right. Behind an IMU at most two of the IMU's registers a call.
+        Each register is read in turn. A wrong one is written and read again, and no measurement is delivered until all
+        have been read as correct. Behind an IMU a call accesses at most two of the IMU's registers.
         """
         state = self._state
         row = self._row
@@ -396,7 +396,7 @@ class Magnetometer:
 
     @micropython.native
     def _judge(self, value):
-        """The register of this row was read: go on to the next, or have it written."""
+        """The register of this row was read: go on to the next row, or write it."""
         state = self._state
         step = state[_STEP]
         row = self._row
@@ -418,7 +418,7 @@ class Magnetometer:
 
     @micropython.native
     def _missed(self):
-        """No answer: tried again, but two in a row mean that it is gone, to be looked for from the beginning."""
+        """No answer: try again. Two in a row mean that the chip is gone: search for it from the beginning."""
         self._misses += 1
         if self._misses > 1:
             self._misses = self._row = 0

@@ -30,7 +30,7 @@ _FIFO_COUNTH = const(0x72)
 
 _DATA_RDY = const(0x01)  # INT_STATUS and INT_ENABLE
 _FIFO_OFLOW = const(0x10)
-_NO_STATUS = const(0xA4)  # bits of INT_STATUS that no part of the family ever sets (RM 4.16)
+_NO_STATUS = const(0xA4)  # bits of INT_STATUS that no part of the family sets (RM 4.16)
 _FIFO_ENABLE = const(0x40)  # USER_CTRL.FIFO_EN
 _I2C_MST_EN = const(0x20)
 _SLV_CTRL = (0x27, 0x2A, 0x2D, 0x30, 0x34)  # I2C_SLV0_CTRL to I2C_SLV4_CTRL
@@ -38,7 +38,7 @@ _FIFO_ALL = const(0xF8)  # FIFO_EN: TEMP, XG, YG, ZG, ACCEL
 _DEVICE_RESET = const(0x80)
 _SLEEP = const(0x40)
 _CLK_PLL = const(0x01)  # CLKSEL 1, PLL on the X gyro: RM 4.28 prefers it to the internal oscillator
-_MASTER_MS = const(5)  # in which the master ends 24 bytes and five addresses at the slowest clock
+_MASTER_MS = const(5)  # the master needs it for 24 bytes and five addresses at the slowest clock
 _EXT_BYTES = const(24)  # EXT_SENS_DATA
 _PACKET = const(14)  # accel x y z, temperature, gyro x y z
 _HEAD = const(2)  # bytes before a packet, see unpack()
@@ -53,18 +53,18 @@ _COUNT_MASK = const(0x3FFFFFFF)
 
 
 class Mpu(Counters):
-    """A chip of the family behind a port, which says how it is connected:
+    """A chip of the family behind a port. The port says how the chip is connected:
 
         registers    I2CRegisters or SPIRegisters
-        interface    the bits of USER_CTRL that the bus wants: I2C_IF_DIS or none
+        interface    the bits of USER_CTRL that the bus needs: I2C_IF_DIS or none
         after_reset  pairs (register, value) that follow DEVICE_RESET
         where        for messages: "at 0x68"
         prepare()    before the first access
         find()       (WHO_AM_I, row of mpu_parts.PARTS); waits for the chip, raises the driver's own error
 
-    Constructing touches no bus. configure() finds, resets and starts the chip. Then, in a timer's or a pin's
-    interrupt, read() fills counts (ax ay az gx gy gz mx my mz temp flags) and health() looks after the configuration,
-    see mpu_monitor.Monitor; fifo_poll() and fifo_next(), see mpu_fifo.Fifo, take the place of read() in FIFO mode.
+    The constructor touches no bus. configure() finds, resets and starts the chip. Then, in a timer's or a pin's
+    interrupt, read() fills counts (ax ay az gx gy gz mx my mz temp flags), and health() checks the configuration, see
+    mpu_monitor.Monitor. In FIFO mode fifo_poll() and fifo_next() replace read(), see mpu_fifo.Fifo.
 
         imu.configure(accel_range_g=8, gyro_range_dps=2000, sample_rate_hz=200)
 
@@ -74,12 +74,12 @@ class Mpu(Counters):
             imu.health()
 
     In a program, accel(), gyro() and temperature() give the newest sample in g, deg/s and degC. As a context
-    manager (`with`) the driver puts the chip to sleep in the end; entering configures nothing.
+    manager (`with`) the driver puts the chip to sleep at the end; entering configures nothing.
 
-    Counters, wrapping at 2**30: errors (faults of the bus; on SPI what reads as a floating bus), stale (read() found
+    Counters, wrapping at 2**30: errors (faults of the bus; on SPI, reads of a floating bus), stale (read() found
     nothing new), resets (of the chip by itself), full_resets (by health(), when no samples came), fifo_overflows,
-    fifo_resets, fifo_lost (packets, as far as they could be counted). fifo_level is what the last poll left in the
-    chip. chip is the part's name, who_am_i its identity.
+    fifo_resets, fifo_lost (packets, as far as they could be counted). fifo_level is the number of packets that the
+    last poll left in the chip. chip is the part's name, who_am_i its identity.
 
     Set-up methods are not interrupt-safe: stop the tick first.
     """
@@ -93,7 +93,7 @@ class Mpu(Counters):
         self.chip = None
         self.who_am_i = None
         self.family_6500 = False
-        self.aux_device = None  # takes what comes behind the sample
+        self.aux_device = None  # takes the bytes behind the sample
         self.table = RegisterTable(registers)
         self.monitor = Monitor(registers, self.table, counts)
         self.fifo = Fifo(registers, self.table, self.monitor, counts)
@@ -101,7 +101,7 @@ class Mpu(Counters):
         self._temperature = mpu_parts.T_6050
         self._begun = False
         self._configured = False
-        # What every tick calls is looked up once, see mpu_monitor.Monitor.
+        # Methods that every tick calls are looked up once, see mpu_monitor.Monitor.
         self._read_into = registers.read_into
         self.read = self.read
         self.health = self.monitor.health
@@ -118,9 +118,9 @@ class Mpu(Counters):
     def read(self):
         """Fetch the newest sample into counts; returns its flags (bit 0: fresh).
 
-        One burst from INT_STATUS on, so that DATA_RDY tells a new sample from one already read.
-        When there is none, or the bus fails, or the gyro has not settled after a repair, bit 0 is
-        clear and the words keep what they held.
+        One burst from INT_STATUS on: DATA_RDY distinguishes a new sample from one already read. If there is no new
+        sample, or the bus fails, or the gyro has not settled after a repair, bit 0 is clear and the words keep their
+        values.
         """
         if self.monitor.state:
             return self._withheld()
@@ -144,7 +144,7 @@ class Mpu(Counters):
     def _withheld(self):
         """read() while the chip is repaired or the gyro settles."""
         if self.monitor.state == _RESET:
-            return self.monitor.not_fresh()  # the chip is to be left alone
+            return self.monitor.not_fresh()  # the chip must not be accessed
         try:
             self._read_into(_INT_STATUS, self._burst)
         except OSError:
@@ -154,7 +154,7 @@ class Mpu(Counters):
         return self.counts[_FLAGS]
 
     def _is_sample(self, raw):
-        """Is there a new sample? Answers everything else that INT_STATUS says."""
+        """Is there a new sample? Handles every other value of INT_STATUS."""
         status = raw[1]
         raw[1] = 0xFF
         if status & _NO_STATUS:  # a floating bus, or a transfer that did not fill the buffer
@@ -163,7 +163,7 @@ class Mpu(Counters):
         if status & _FIFO_OFLOW:
             self.monitor.fifo_misaligned = 1  # reading the flag has cleared it
         if status & _DATA_RDY:
-            raw[1] = _DATA_RDY  # the rest is answered
+            raw[1] = _DATA_RDY  # the rest is handled
             return True
         self.stale = (self.stale + 1) & _COUNT_MASK
         self.monitor.no_sample(raw)
@@ -175,7 +175,7 @@ class Mpu(Counters):
         return (self.counts[9] * mul + (div >> 1)) // div + offset
 
     def bus_fault(self):
-        """Count a fault of the bus that somebody else has met at this chip, and have health() look at it."""
+        """Count a bus fault that another part of the driver has met, and have health() check the chip."""
         self.monitor.fault()
 
     # For programs: these allocate
@@ -198,7 +198,7 @@ class Mpu(Counters):
         return self
 
     def __exit__(self, kind, error, traceback):
-        """FIFO off and asleep; a bus that fails is not to hide the exception that ends the block."""
+        """FIFO off, chip asleep. A bus fault here must not hide the exception that ends the block."""
         if not self._configured:
             return
         try:
@@ -220,7 +220,7 @@ class Mpu(Counters):
         settle=True,
         accel_dlpf=None,
     ):
-        """Set the chip up and start it; finds and resets it first unless begin() has.
+        """Set the chip up and start it. Without begin() it finds and resets it first.
 
         accel_range_g   2, 4, 8 or 16
         gyro_range_dps  250, 500, 1000 or 2000
@@ -235,13 +235,12 @@ class Mpu(Counters):
         accel_dlpf      MPU6500 family: A_DLPF_CFG 0..7, accelerometer bandwidth 460, 184, 92, 41, 20,
                         10, 5, 460 Hz, or "bypass" (1130 Hz; RM-6500 4.8). None: as dlpf
 
-        Afterwards accel_lsb_per_g is an int, gyro_scale the exact LSB per deg/s as (num, den),
-        sample_rate the exact rate as (num, den) Hz; bandwidth_hz, accel_bandwidth_hz, dlpf,
-        accel_range_g and gyro_range_dps say what was set; FIFO mode is off, the INT pin gives pulses,
-        active high.
+        Afterwards accel_lsb_per_g is an int, gyro_scale the exact LSB per deg/s as (num, den), sample_rate the exact
+        rate as (num, den) Hz. bandwidth_hz, accel_bandwidth_hz, dlpf, accel_range_g and gyro_range_dps hold what was
+        set. FIFO mode is off. The INT pin gives pulses, active high.
 
-        Raises ValueError for a setting that the part does not have, and the driver's own error for
-        a chip that is absent, is another one, or does not keep what was written to it.
+        Raises ValueError for a setting that the part does not have, and the driver's own error for a chip that is
+        absent, is another one, or does not keep what was written to it.
         """
         self._configured = False
         afs = mpu_parts.index("accel_range_g", accel_range_g, mpu_parts.ACCEL_RANGES)
@@ -255,7 +254,7 @@ class Mpu(Counters):
         self.monitor.fifo_misaligned = 0
         self.attach(None, 0)
         rows = [
-            # awake first: the other registers keep what is written either way
+            # awake first: the other registers keep what is written in any case
             (_PWR_MGMT_1, _CLK_PLL),
             (_PWR_MGMT_2, 0),
             (_SMPLRT_DIV, filters.smplrt_div),
@@ -266,7 +265,7 @@ class Mpu(Counters):
         if self.family_6500:
             rows.append((_ACCEL_CONFIG2, filters.accel_config2))
         rows += [
-            # never INT_RD_CLEAR: any read would then wipe the FIFO overflow flag (RM 4.14)
+            # never INT_RD_CLEAR: any read would then clear the FIFO overflow flag (RM 4.14)
             (_INT_PIN_CFG, 0),
             (_FIFO_EN, 0),
             (_INT_ENABLE, _DATA_RDY),
@@ -286,7 +285,7 @@ class Mpu(Counters):
         self.accel_lsb_per_g = 16384 >> afs
         self.gyro_scale = mpu_parts.GYRO_SCALES[fs]
         self.sample_rate = num, den = filters.sample_rate
-        # the gyro's start-up, and four times the filter's delay: then its step response has died away
+        # the gyro's start-up, and four times the filter's delay: then its step response has settled
         start_ms = _GYRO_START_6500_MS if self.family_6500 else _GYRO_START_MS
         self.settle_ms = start_ms + 4 * filters.delay_ms
         self._stop()
@@ -315,16 +314,16 @@ class Mpu(Counters):
         self._begun = True
 
     def configure_interrupt(self, active_low=False, open_drain=False, latch=False):
-        """How the INT pin tells of a sample: a pulse of 50 us, or with latch a level until read()."""
+        """Set how the INT pin signals a sample: a pulse of 50 us, or with latch a level until read()."""
         self._need_configured()
         value = (0x80 if active_low else 0) | (0x40 if open_drain else 0) | (0x20 if latch else 0)
         self.table.set(_INT_PIN_CFG, value)
 
     def fifo_enable(self, batch=8):
-        """Let the chip queue its samples; from now on drive it with fifo_poll() and fifo_next().
+        """Let the chip queue its samples; read them with fifo_poll() and fifo_next().
 
-        batch: packets (14 bytes, and what attach() adds) that one fifo_poll() fetches at most, in one
-        burst; 1 to what the FIFO holds.
+        batch: packets (14 bytes, and the bytes of attach()) that one fifo_poll() fetches at most, in one burst; 1 to
+        the capacity of the FIFO.
         """
         self._need_configured()
         if self.dlpf == "bypass":
@@ -341,7 +340,7 @@ class Mpu(Counters):
         self.fifo.on = True
 
     def fifo_disable(self):
-        """Back to read(). What the FIFO still holds is dropped."""
+        """Back to read(). The contents of the FIFO are dropped."""
         self._need_configured()
         self.fifo.stop()
         self.monitor.fifo_misaligned = 0
@@ -352,9 +351,9 @@ class Mpu(Counters):
     def self_test(self):
         """Actuate the proof masses and judge the response, by the part's own formulas.
 
-        To be run at rest; takes 0.4 to 0.7 s. Returns (passed, changes): six ints for accel x y z and
-        gyro x y z, how far the response is off the factory's, in per mille, or None where the part
-        carries no factory value. passed is None when there is nothing to judge by.
+        Run it at rest; it takes 0.4 to 0.7 s. Returns (passed, changes). changes: six ints for accel x y z and gyro
+        x y z, the difference of the response from the factory's in per mille, or None if the part has no factory
+        value. passed is None when there is no value at all.
 
         MPU6050: within 14 % (PS 6.1, 6.2). MPU6500 family: gyro at least half, accelerometer half to
         one and a half times the factory's, or absolute limits without one, and a gyro offset within 20
@@ -385,24 +384,23 @@ class Mpu(Counters):
         self.table.set(_PWR_MGMT_1, _CLK_PLL)
         self._settle()
         if self.fifo.on:
-            self.fifo.drop()  # what came in while the gyro settled is not wanted
+            self.fifo.drop()  # drop the samples that came while the gyro settled
 
     def configuration(self):
         """The configuration as a list of (register, value), in the order in which it is written."""
         return [row[:2] for row in self.table.rows()]
 
-    # Set-up for what works through this chip: a device on its auxiliary bus
+    # Set-up for a device on this chip's auxiliary bus
 
     def set_rows(self, rows):
-        """Configure registers and have health() watch them and a repair write them back.
+        """Configure registers; health() then checks them and a repair restores them.
 
-        rows: (register, value, mask), mask being the bits that are compared. They are written in this
-        order and read back; a register that the table has already keeps its place there, a new one
-        comes before USER_CTRL, which starts FIFO and master. configure() forgets them.
+        rows: (register, value, mask); mask has the bits that are compared. They are written in this order and read
+        back. A register that is in the table already keeps its place. A new one comes before USER_CTRL, which starts
+        FIFO and master. configure() removes them.
 
-        In FIFO mode what is in the FIFO is dropped; where the rows change what a slave reads, call
-        attach() again. Raises error_class for a bus fault and for a register that does not keep its
-        value.
+        In FIFO mode the contents of the FIFO are dropped. If the rows change what a slave reads, call attach() again.
+        Raises error_class for a bus fault and for a register that does not keep its value.
         """
         self._need_configured()
         if self.fifo.on:
@@ -410,29 +408,28 @@ class Mpu(Counters):
         self.table.merge(rows)
 
     def set_user_ctrl(self, bits, mask):
-        """Change the bits of USER_CTRL that mask names, I2C_MST_EN (0x20) say, on the chip as well."""
+        """Change the bits of mask in USER_CTRL, for example I2C_MST_EN (0x20), also on the chip."""
         self._need_configured()
         self.table.change_last(bits, mask)
         self.table.set(_USER_CTRL, self.table.last())
 
     @property
     def master_enabled(self):
-        """Is the auxiliary master to run, as set_user_ctrl() has it?"""
+        """Whether set_user_ctrl() has enabled the auxiliary master."""
         return bool(self.table.last() & _I2C_MST_EN)
 
     def attach(self, device, length, fifo_en=0x01):
-        """Fetch EXT_SENS_DATA_00 and on, `length` bytes (0 to 24), in the same burst as the sample.
+        """Fetch `length` bytes (0 to 24) from EXT_SENS_DATA_00 on, in the same burst as the sample.
 
-        In FIFO mode they come behind the gyro in each packet: fifo_en names the slaves in FIFO_EN
-        (SLV0 0x01, SLV1 0x02, SLV2 0x04), which must be set up to read `length` bytes in all. device has
+        In FIFO mode they follow the gyro in each packet. fifo_en names the slaves in FIFO_EN (SLV0 0x01, SLV1 0x02,
+        SLV2 0x04), which must be set up to read `length` bytes in all. device has
 
             take(raw, at, counts)   called after a fresh sample: raw[at] to raw[at + length - 1] are its
                                     bytes; fills counts[6] to counts[8], returns the flags to add: 2 or 0
-            health()                called by every second health() while the chip is in order
+            health()                called by every second health() while the chip has no fault
 
-        and neither may allocate or raise. attach(None, 0) ends it. In FIFO mode this starts the FIFO
-        anew, with fewer packets in a batch if it holds fewer; error_class is raised, and FIFO mode
-        over, if the packets turn out to have another length.
+        Neither may allocate or raise. attach(None, 0) ends it. In FIFO mode this restarts the FIFO, with fewer packets
+        in a batch if it holds fewer. If the packets have another length, it raises error_class and FIFO mode ends.
         """
         if not 0 <= length <= _EXT_BYTES:
             raise ValueError(f"length {length!r} is not 0 to {_EXT_BYTES}")
@@ -449,7 +446,7 @@ class Mpu(Counters):
 
     @property
     def repair_calls(self):
-        """Calls of health() that a repair takes at most, from the first stale sample on, if the bus works."""
+        """The most calls of health() that a repair takes, from the first stale sample on, if the bus works."""
         return self.monitor.repair_calls()
 
     # Its parts
@@ -460,14 +457,14 @@ class Mpu(Counters):
         self.aux_device = self.fifo.device = device
 
     def _length_behind(self, length, fifo_en):
-        """Buffers for samples with so many bytes behind them."""
+        """Make buffers for samples with so many bytes behind them."""
         self.fifo.packet = _PACKET + length
         self._fifo_bits = _FIFO_ALL | (fifo_en & 0x07 if length else 0)
         self._raw = bytearray(_HEAD + _PACKET + length)  # see unpack(); raw[1] is INT_STATUS
         self._burst = memoryview(self._raw)[_HEAD - 1 :]
 
     def _measure_packet(self):
-        """Does a sample bring as many bytes as attach() was told? Raises error_class if not."""
+        """Raise error_class unless a sample brings as many bytes as attach() was told."""
         wait_ms = 5 + 2000 * self.sample_rate[1] // self.sample_rate[0]
         packet = self.fifo.packet
         level = 0
@@ -482,18 +479,18 @@ class Mpu(Counters):
             if level == packet:
                 return
         raise self.error_class(
-            f"a sample does not put {packet} bytes into the FIFO (at the last look {level}): do "
-            "the slaves that attach() was told of read what it was told?"
+            f"a sample does not put {packet} bytes into the FIFO (last count {level}): do "
+            "the slaves of attach() read as many bytes as it was told?"
         )
 
     def _adopt(self, found):
-        """Become the part that was found."""
+        """Take over the properties of the part that was found."""
         self.who_am_i, part = found
         self.monitor.who_am_i = self.who_am_i
         self.chip, self.family_6500, self.fifo.size, self._temperature = part
 
     def _reset(self):
-        """DEVICE_RESET, waited for; raises the driver's own error if it does not come to an end."""
+        """DEVICE_RESET; waits for it, and raises the driver's own error if it does not end."""
         registers = self.registers
         for _ in range(3):
             try:
@@ -501,7 +498,7 @@ class Mpu(Counters):
                 registers.write(_PWR_MGMT_1, _DEVICE_RESET)
                 break
             except OSError:
-                # perhaps the chip let go of the bus as it reset: once more is safe
+                # perhaps the chip released the bus as it reset: writing again is safe
                 time.sleep_ms(1)
         time.sleep_ms(100)  # what the register maps ask for after DEVICE_RESET
         for _ in range(10):
@@ -517,9 +514,9 @@ class Mpu(Counters):
     def _stop(self):
         """FIFO and auxiliary master off.
 
-        The master may be running even before the first configure(), since a reset of the board need
-        not be one of the chip. Cut off within a transaction (by the chip's reset, too) it would leave
-        the device on its bus hanging (RM-6500 4.33): it finishes what it began if its slots go first.
+        The master may be running even before the first configure(), because a reset of the board does not reset the
+        chip. A transaction that is interrupted (also by the chip's reset) can hang the device on its bus (RM-6500
+        4.33). The master finishes a transaction if its slots are disabled first.
         """
         if self.read_register(_USER_CTRL) & _I2C_MST_EN:
             for control in _SLV_CTRL:
@@ -529,7 +526,9 @@ class Mpu(Counters):
 
     def _settle(self):
         time.sleep_ms(self.settle_ms)
-        self.registers.read_registers(_INT_STATUS, self._burst)  # drops what was ready meanwhile
+        self.registers.read_registers(
+            _INT_STATUS, self._burst
+        )  # drops a sample that was ready meanwhile
         self.monitor.heard()
 
     def _need_configured(self):

@@ -122,12 +122,12 @@ class I2CPort:
 
 
 class MPU6050(Mpu):
-    """An MPU6050 on an I2C bus; what it can do says mpu.Mpu.
+    """An MPU6050 on an I2C bus; mpu.Mpu describes what it can do.
 
-    i2c             has readfrom_mem_into and writeto; give machine.I2C a short timeout, for a stuck
-                    bus blocks the tick as long
+    i2c             has readfrom_mem_into and writeto; give machine.I2C a short timeout: a stuck
+                    bus blocks the tick that long
     address         0x68 with AD0 low, 0x69 with AD0 high; None: whichever answers
-    accept_unknown  take a part whose identity is not in the table for an MPU6050 with a FIFO of 512 bytes
+    accept_unknown  use a part whose identity is not in the table as an MPU6050 with a FIFO of 512 bytes
     """
 
     def __init__(self, i2c, address=None, accept_unknown=False):

@@ -36,7 +36,7 @@ class SPIPort:
     """How a chip of the family is found on an SPI bus; see mpu.Mpu."""
 
     where = "on SPI"
-    interface = _I2C_IF_DIS  # or a glitch on CS makes the chip an I2C slave
+    interface = _I2C_IF_DIS  # without it a glitch on CS makes the chip an I2C slave
     # RM 4.28: over SPI both H_RESET and SIGNAL_PATH_RESET, each followed by 100 ms
     after_reset = ((_USER_CTRL, _I2C_IF_DIS), (_SIGNAL_PATH_RESET, 0x07))
 
@@ -82,17 +82,17 @@ class SPIPort:
 
 
 class MPU6500(Mpu):
-    """An MPU6500 on an SPI bus of its own, in mode 0 or 3; what it can do says mpu.Mpu.
+    """An MPU6500 on an SPI bus of its own, in mode 0 or 3; mpu.Mpu describes what it can do.
 
-    spi             has write, readinto and, to be clocked as below, init(baudrate=); a machine.SPI
+    spi             has write, readinto and, for two clocks, init(baudrate=); a machine.SPI
     cs              chip select, an output pin, called with 0 and 1
-    accept_unknown  take a part whose identity is not in the table for an MPU6500
+    accept_unknown  use a part whose identity is not in the table as an MPU6500
     fast_hz         clock for sensor bursts, at most 20 MHz (PS 6.5)
     slow_hz         clock for everything else, at most 1 MHz (PS 6.5)
 
-    Where the bus cannot be set to another clock without allocating memory, or takes longer for it than
-    it saves, everything runs at slow_hz; where it cannot be set at all, at the clock that it was made
-    with, which must then be 1 MHz or less. burst_hz says what came of it (0: as made).
+    Everything runs at slow_hz if a change of clock allocates memory or takes longer than it saves. If the clock cannot
+    be changed at all, the bus keeps its first clock, which must then be 1 MHz or less. burst_hz is the clock of bursts
+    (0: the bus's first clock).
 
         imu = MPU6500(machine.SPI(5, 1_000_000), machine.Pin("PF6", machine.Pin.OUT, value=1))
         imu.configure(accel_range_g=8, gyro_range_dps=2000, sample_rate_hz=1000)

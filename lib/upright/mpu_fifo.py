@@ -1,5 +1,5 @@
 # Packets of an MPU6050 or MPU6500: how a sample is unpacked, and the chip's FIFO, drained in whole packets.
-# Needs mpu_monitor.py; registers and table are handed in. Runs on MicroPython >= 1.22 and under CPython with
+# Needs mpu_monitor.py; registers and table are passed in. Runs on MicroPython >= 1.22 and under CPython with
 # a `micropython` shim. RM is RM-MPU-6000A rev 4.2.
 
 import micropython
@@ -29,9 +29,9 @@ _COUNT_MASK = const(0x3FFFFFFF)
 def unpack(buffer: ptr8, at: int, counts: ptr16) -> int:
     """Big-endian accel, temperature, gyro at buffer[at..at+13] into counts; returns the flags.
 
-    The first packet stands at buffer[2], behind INT_STATUS: if that is not just DATA_RDY, this returns 0 and counts
-    stay. It is made 0xff, which is no status: a transfer that does not fill the buffer gives no sample. buffer[0]
-    is 1 once a poll has found no sample, and cleared here.
+    The first packet is at buffer[2], behind INT_STATUS. If that is not exactly DATA_RDY, this returns 0 and counts stay
+    unchanged. Afterwards it is set to 0xff, which is not a status: so a transfer that does not fill the buffer gives no
+    sample. buffer[0] is 1 after a poll that found no sample; it is cleared here.
     """
     if at == 2:
         if buffer[1] != 1:
@@ -60,8 +60,8 @@ class Fifo:
 
     size, packet  bytes of the FIFO and of a packet
     on            True while the chip queues its samples
-    level         packets left in the chip at the last look
-    device        takes what comes behind each sample, or None
+    level         packets left in the chip at the last poll
+    device        takes the bytes behind each sample, or None
 
     overflows, resets (restarts of the FIFO) and lost (packets, as far as they could be counted) are counters.
     """
@@ -94,7 +94,7 @@ class Fifo:
     # Set-up
 
     def prepare(self, batch):
-        """Buffers for batches of so many packets. Raises ValueError for more than the FIFO holds."""
+        """Make buffers for batches of so many packets. Raises ValueError for more than the FIFO holds."""
         size = self.packet
         if not isinstance(batch, int) or not 1 <= batch <= self.size // size:
             raise ValueError(f"batch {batch!r} is not 1 to {self.size // size}")
@@ -107,24 +107,24 @@ class Fifo:
         self.stop()
 
     def stop(self):
-        """Off; what the FIFO still holds is dropped."""
+        """Switch the FIFO off; its contents are dropped."""
         self.on = False
         self._pending = self.level = 0
 
     def drop(self):
-        """Forget what the FIFO holds: it is restarted before the next packet."""
+        """Drop the contents of the FIFO: it is restarted before the next packet."""
         self._pending = 0
         self._monitor.fifo_misaligned = 1
 
-    # The tick: nothing below allocates, waits, raises or uses a float. Small functions for the reason told in
-    # mpu_monitor.py.
+    # The tick: nothing below allocates, waits, raises or uses a float. The functions are small for the reason
+    # given in mpu_monitor.py.
 
     def poll(self):
         """Fetch up to `batch` packets; returns how many next() has: 0 = none, or a fault.
 
-        The packets are given out only after a look at INT_STATUS that follows the burst: if the
-        FIFO overflowed at any time up to there, or the chip reset itself, or the bus failed, packet
-        boundaries are not certain any more; then the whole batch is dropped and the FIFO restarted.
+        INT_STATUS is read after the burst, before any packet is delivered. If the FIFO has overflowed, the chip has
+        reset itself or the bus has failed, the packet boundary is uncertain. Then the whole batch is dropped and the
+        FIFO restarted.
         """
         if self._pending or not self.on or self._monitor.state >= RESTORE:
             return self._pending
@@ -137,8 +137,8 @@ class Fifo:
         if not packets:
             self._monitor.no_sample(self.buffer)
             return 0
-        # What came last is a whole packet, so where a fraction is left either the chip is writing one
-        # or the first has lost its beginning: wait, if need be until the FIFO is full, and drop all.
+        # The last packet is complete. So if a part of a packet is left, either the chip is writing one, or the
+        # first one has lost its beginning: wait, if necessary until the FIFO is full, and drop all.
         level -= packets * self.packet
         if level and packets < self._full:
             return 0
@@ -174,15 +174,13 @@ class Fifo:
         level = self._pair[0] << 8 | self._pair[1]
         if level <= self.size:
             return level
-        self._monitor.fifo_misaligned = (
-            1  # a chip that dies in the middle leaves the bus high: 0xffff
-        )
+        self._monitor.fifo_misaligned = 1  # a chip that fails here leaves the bus high: 0xffff
         self._monitor.fault()
         return 0
 
     def drain(self, n, fraction):
-        """Take n packets out, or none if they may not be whole ones."""
-        # until shown otherwise: an interrupted burst has taken part of a packet
+        """Read n packets, or none if they may be incomplete."""
+        # until the burst is complete: an interrupted one has taken part of a packet
         self._monitor.fifo_misaligned = 1
         if self._fetch(n) and not fraction:
             self._monitor.fifo_misaligned = 0
@@ -199,15 +197,15 @@ class Fifo:
         return 0
 
     def take_all(self):
-        """The batch goes to somebody who unpacks it by himself."""
+        """The caller unpacks the batch itself."""
         self._pending = 0
 
     def lose(self, n):
-        """Count packets that nobody gets."""
+        """Count lost packets."""
         self.lost = (self.lost + n) & _COUNT_MASK
 
     def _fetch(self, n):
-        """Read n packets in one burst; 1 if nothing has shifted or replaced them up to its end."""
+        """Read n packets in one burst; 1 if nothing has shifted or replaced them by its end."""
         self._status[0] = 0
         try:
             self._read_into(_FIFO_R_W, self._views[n])
@@ -218,15 +216,15 @@ class Fifo:
                 return 0
             if self._status[0] & _FIFO_OFLOW:
                 return 0
-            # DATA_RDY since the last look proves that INT_ENABLE still holds, so that there was no
-            # reset. Without it ask: a FIFO that a reset has emptied repeats its last byte for ever.
+            # DATA_RDY since the last read proves that INT_ENABLE is still set, so there was no reset.
+            # Without it, check: a FIFO that a reset has emptied repeats its last byte.
             if self._status[0] & _DATA_RDY:
                 return 1
             self._read_into(_USER_CTRL, self._byte)
         except OSError:
             self._monitor.fault()
             return 0
-        # the whole register: a chip that dies now leaves the bus high, 0xff
+        # the whole register: a chip that fails now leaves the bus high, 0xff
         if (self._byte[0] ^ self._table.last()) & ~_I2C_IF_DIS == 0:
             return 1
         self._monitor.doubt()
@@ -249,7 +247,7 @@ class Fifo:
 
 
 class Counters:
-    """What the monitor and the FIFO of an object count, under the names that programs use."""
+    """The counters of an object's monitor and FIFO, by the names that programs use."""
 
     @property
     def errors(self):

@@ -1,5 +1,5 @@
-# Watches over the registers of an MPU6050 or MPU6500 in the tick and repairs what a reset of the chip has undone.
-# Needs the registers and the table that are handed in. Runs on MicroPython >= 1.22 and under CPython with a
+# Checks the registers of an MPU6050 or MPU6500 in the tick and restores them after a reset of the chip.
+# Needs the registers and the table that are passed in. Runs on MicroPython >= 1.22 and under CPython with a
 # `micropython` shim. RM is RM-MPU-6000A rev 4.2.
 
 import time
@@ -7,9 +7,11 @@ import time
 import micropython
 from micropython import const
 
-# What health() answers
-HEALTH_OK = const(0)  # the register read back as written
-HEALTH_MISMATCH = const(1)  # it did not: the chip has reset itself; the next call begins the repair
+# What health() returns
+HEALTH_OK = const(0)  # the register has the value of the table
+HEALTH_MISMATCH = const(
+    1
+)  # it has another value: the chip has reset itself; the next call begins the repair
 HEALTH_REPAIRING = const(2)  # the repair goes on
 HEALTH_BUS_ERROR = const(3)  # the bus failed; the same step is taken again next time
 
@@ -34,25 +36,25 @@ _WAIT = const(0)  # the value is a time in ms since the last write
 _RESET_MS = const(100)  # what the register maps ask for after DEVICE_RESET and SIGNAL_PATH_RESET
 _MASTER_MS = const(
     5
-)  # in which the master ends what it began: 24 bytes, five addresses at the slowest clock
+)  # the master finishes a transaction in it: 24 bytes, five addresses at the slowest clock
 
 # Bits of _doubt
-_DOUBT = const(1)  # a reset would explain what was seen: compare PWR_MGMT_1 out of turn
+_DOUBT = const(1)  # a reset would explain the fault: compare PWR_MGMT_1 out of turn
 _LOOKED = const(2)  # the last call did
 
 _FLAGS = const(10)  # of counts
 _FULL_SCALE_FLAGS = const(0x0C)
 _COUNT_MASK = const(0x3FFFFFFF)  # counters wrap within a small int of 32-bit ports
-_TRIES = const(3)  # repairs in a row that do not hold, before a full reset
-_PATIENCE_MS = const(250)  # and ten samples: without a sample for so long the chip is reset
+_TRIES = const(3)  # failed repairs in a row before a full reset
+_PATIENCE_MS = const(250)  # and ten samples: after so long without a sample the chip is reset
 
 
 class Monitor:
     """One register a call is compared with the table; a difference means that the chip has reset itself.
 
-    Then RESTORE writes the table back, VERIFY reads it back, and SETTLE lasts until the gyro has settled. Where
-    the registers are right but no samples come, or where a repair does not hold three times in a row, the chip
-    gets a full RESET first. The first row of the table is PWR_MGMT_1, the last USER_CTRL.
+    Then RESTORE writes the table, VERIFY reads it back, and SETTLE lasts until the gyro has settled. If the registers
+    are correct but no samples come, or if three repairs in a row fail, the chip gets a full RESET first. The first row
+    of the table is PWR_MGMT_1, the last USER_CTRL.
 
     errors, resets (of the chip by itself) and full_resets (by this) are counters.
     """
@@ -62,7 +64,7 @@ class Monitor:
         self.resets = 0
         self.full_resets = 0
         self.fifo_misaligned = (
-            0  # 1: the FIFO's packet boundary is not certain, it has to be restarted
+            0  # 1: the FIFO's packet boundary is uncertain, so it must be restarted
         )
         self.device = None  # what is attached behind the chip; its health() has every second turn
         self.who_am_i = None
@@ -72,17 +74,17 @@ class Monitor:
         self._counts = counts
         self._byte = bytearray(1)
         self.start(b"", 0, 0, 0)
-        # MicroPython looks for a method among the attributes of the instance first, and a table of attributes that
-        # is (nearly) full is searched from end to end, 1500 instructions for a call. So what every tick calls
-        # stands in that table.
+        # MicroPython looks for a method among the attributes of the instance first. A table of attributes that is
+        # (nearly) full is searched from end to end: 1500 instructions a call. So the methods that every tick calls
+        # are stored as attributes.
         self.health = self.health
         self._compare = self._compare
 
     def start(self, after_reset, interface, settle_samples, period_ms):
-        """Begin to watch a chip that has just been configured.
+        """Start to check a chip that has just been configured.
 
         after_reset     pairs (register, value) that a full reset ends with
-        interface       the bits of USER_CTRL that the bus wants
+        interface       the bits of USER_CTRL that the bus needs
         settle_samples  samples to withhold after a repair
         """
         steps = [(register, 0) for register in _SLV_CTRL] + [(_WAIT, _MASTER_MS)]
@@ -100,7 +102,7 @@ class Monitor:
         self._left = 0  # samples still to be withheld
         self._tries = 0
         self._doubt = 0
-        self._silent = 0  # 1: no sample for longer than the patience
+        self._silent = 0  # 1: no sample for longer than the time limit
         self._device_next = 0
         self._stepped = 0  # when the last step of a full reset was written
         self.heard()
@@ -115,14 +117,14 @@ class Monitor:
         return 2 * len(self._table.numbers) + 3
 
     # The tick: nothing below allocates, waits, raises or uses a float. A bytecode frame over 11 words comes from the
-    # heap, and a `try` takes three of them: hence so many small functions, and hardly a name beside a `try`.
+    # heap, and a `try` takes three of them. So the functions are small, with few names beside a `try`.
 
     @micropython.native
     def health(self):
         """Take the next step; returns a HEALTH_ state.
 
-        In WATCH a row of the table in turn; PWR_MGMT_1 out of turn (at most every second call) after a stale or
-        failed sample; every second turn goes to what is attached.
+        In WATCH it compares the rows of the table in turn, and PWR_MGMT_1 out of turn after a stale or failed sample
+        (at most every second call). Every second turn goes to the attached device.
         """
         state = self.state
         if state >= RESTORE:
@@ -140,7 +142,7 @@ class Monitor:
         return self._take_row()
 
     def _look(self):
-        """PWR_MGMT_1 out of turn."""
+        """Compare PWR_MGMT_1 out of turn."""
         self._doubt = _LOOKED
         found = self._compare(0)
         if found == HEALTH_MISMATCH:
@@ -154,7 +156,7 @@ class Monitor:
         row = self._at
         last = len(self._table.numbers) - 1
         found = self._compare(row)
-        # while the FIFO waits for its restart, USER_CTRL may be anything
+        # while the FIFO waits for its restart, USER_CTRL may have any value
         if found == HEALTH_MISMATCH and not (row == last and self.fifo_misaligned):
             return self._repair()
         if found == HEALTH_BUS_ERROR:
@@ -171,14 +173,14 @@ class Monitor:
 
     @micropython.native
     def _compare(self, row):
-        """Does a register still hold what the table says?"""
+        """Does a register still have the value of the table?"""
         table = self._table
         byte = self._byte
         try:
             self._read_into(table.numbers[row], byte)
             if not (byte[0] ^ table.values[row]) & table.masks[row]:
                 return HEALTH_OK
-            # is it the chip that says so, or a floating bus?
+            # does the chip answer, or is the bus floating?
             self._read_into(_WHO_AM_I, byte)
             if byte[0] == self.who_am_i:
                 return HEALTH_MISMATCH
@@ -200,13 +202,13 @@ class Monitor:
         return HEALTH_MISMATCH
 
     def _restore(self):
-        """Write one row back; before the first switch the FIFO off."""
+        """Write one row; before the first one switch the FIFO off."""
         row = self._at
         try:
             if row >= 0:
                 self._write(self._table.numbers[row], self._table.values[row])
             else:
-                # a master that the reset has spared may be within a transaction
+                # a master that still runs may be in a transaction
                 self._read_into(_USER_CTRL, self._byte)
                 self._write(_USER_CTRL, self._interface | self._byte[0] & _I2C_MST_EN)
         except OSError:
@@ -227,7 +229,7 @@ class Monitor:
         self.full_resets = (self.full_resets + 1) & _COUNT_MASK
         self.state = RESET
         self._silent = self._tries = self._left = 0
-        # cut off within a transaction, the master would leave the device on its bus hanging
+        # an interrupted transaction can hang the device on the master's bus
         self._at = 0 if self._table.last() & _I2C_MST_EN else self._without_master
         return HEALTH_REPAIRING
 
@@ -256,17 +258,17 @@ class Monitor:
             self.fault()
             return 0
 
-    # What read() and the FIFO have to tell
+    # Reports of read() and the FIFO
 
     def fault(self):
-        """The bus has failed: counted, and health() is to look at the chip; returns the flags without "fresh"."""
+        """The bus has failed: count it, have health() check the chip, return the flags without "fresh"."""
         self.errors = (self.errors + 1) & _COUNT_MASK
         self._doubt |= _DOUBT
         self.heard()
         return self.not_fresh()
 
     def doubt(self):
-        """Something was seen that a reset of the chip would explain: health() is to look."""
+        """A reset of the chip would explain a fault: have health() check it."""
         self._doubt |= _DOUBT
 
     def no_sample(self, quiet):
@@ -276,17 +278,17 @@ class Monitor:
             quiet[0] = 1
             self.heard()
         elif time.ticks_diff(time.ticks_ms(), self._since) > self._patience_ms:
-            # asleep on purpose?
+            # has sleep() put it to sleep?
             self._silent = 0 if self._table.values[0] & _SLEEP else 1
         return self.not_fresh()
 
     def heard(self):
-        """The patience for the next sample begins anew."""
+        """Restart the time limit for the next sample."""
         self._silent = 0
         self._since = time.ticks_ms()
 
     def withhold(self):
-        """A sample that came before the gyro had settled: counted down, and not fresh."""
+        """A sample that came before the gyro has settled: count it, and clear its fresh bits."""
         self.heard()
         if self._left:
             self._left -= 1

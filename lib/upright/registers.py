@@ -1,5 +1,5 @@
 # The registers of a chip on an I2C or an SPI bus: the same methods on either, for a driver's tick and its set-up.
-# Needs nothing but the bus object that is handed in. Runs on MicroPython >= 1.22 and under CPython with a
+# Needs only the bus object that is passed in. Runs on MicroPython >= 1.22 and under CPython with a
 # `micropython` shim.
 
 import time
@@ -7,7 +7,7 @@ import time
 import micropython
 
 _READ = 0x80  # SPI: first bit of the address byte
-_IDLE = 0xFF  # SPI: sent while reading; should the chip take it for an address, it is a read
+_IDLE = 0xFF  # SPI: sent while reading; if the chip takes it for an address, it is a read
 
 
 def plain_name(register):
@@ -15,17 +15,17 @@ def plain_name(register):
 
 
 class Registers:
-    """What a driver's set-up does with registers; a subclass moves the bytes. Every bus has, for the tick,
+    """Register access for a driver's set-up; a subclass transfers the bytes. For the tick every bus has
 
         read_into(register, buffer)  fill buffer from register on
         write(register, value)       one register
-        write_from(buffer)           buffer[0] is the register, the others go into it and the next ones
+        write_from(buffer)           buffer[0] is the register; the other bytes go into it and the next ones
 
-    which raise OSError when the bus fails and allocate nothing. The methods here may allocate; they raise
-    error_class with the name of the register.
+    They raise OSError when the bus fails, and allocate nothing. The methods here may allocate. They raise error_class
+    with the name of the register.
 
     error_class  the exception class of the driver, an OSError
-    name         how messages show a register: a function of its number
+    name         a function that takes a register's number and returns its name for messages
     """
 
     def __init__(self, error_class, name):
@@ -34,7 +34,7 @@ class Registers:
         self._byte = bytearray(1)
 
     def read_register(self, register):
-        """One register's value."""
+        """The value of one register."""
         self.read_registers(register, self._byte)
         return self._byte[0]
 
@@ -66,8 +66,8 @@ class Registers:
 class I2CRegisters(Registers):
     """Registers of the chip at `address` on an I2C bus.
 
-    i2c  has readfrom_mem_into and writeto; give machine.I2C a short timeout, for a stuck bus blocks the tick
-         as long
+    i2c  has readfrom_mem_into and writeto; give machine.I2C a short timeout: a stuck bus blocks the tick
+         that long
     """
 
     def __init__(self, i2c, address, error_class=OSError, name=plain_name):
@@ -109,8 +109,8 @@ class SPIRegisters(Registers):
     slow_hz  clock of everything else
     fast     (first, last) register that the chip lets be read at fast_hz
 
-    find_clocks() decides whether fast_hz is used; until then the bus keeps the clock that it was made with.
-    burst_hz says what came of it (0: as made).
+    find_clocks() decides whether fast_hz is used. Until then the bus keeps its first clock. burst_hz is the clock of
+    bursts (0: the bus's first clock).
     """
 
     def __init__(
@@ -119,8 +119,8 @@ class SPIRegisters(Registers):
         Registers.__init__(self, error_class, name)
         self.slow_hz = slow_hz
         self.fast_hz = fast_hz
-        self.burst_hz = 0  # while 0 the clock is left alone
-        self._hz = 0  # what the bus runs at
+        self.burst_hz = 0  # 0: the clock is not changed
+        self._hz = 0  # present clock
         self._first, self._last = fast
         self._head = bytearray(1)
         self._out = bytearray(2)
@@ -139,7 +139,7 @@ class SPIRegisters(Registers):
     @micropython.native
     def read_into(self, register, buffer):
         n = len(buffer)
-        # for a byte or two another clock does not pay
+        # for a byte or two a change of clock costs more than it saves
         hz = self.slow_hz
         if n > 2 and register >= self._first and register + n <= self._last + 1:
             hz = self.burst_hz
@@ -170,32 +170,32 @@ class SPIRegisters(Registers):
         finally:
             self._cs(1)
 
-    # What machine.SPI.init(baudrate=) does, by the ports' sources: stm32 (machine_spi.c, spi.c) leaves
-    # polarity and phase alone and takes the next lower power-of-two part of the peripheral's clock
+    # What machine.SPI.init(baudrate=) does, from the ports' sources: stm32 (machine_spi.c, spi.c) keeps
+    # polarity and phase and takes the next lower power-of-two part of the peripheral's clock
     # (84 MHz: 656 kHz for 1 MHz, 5.25 MHz for 10 MHz, 10.5 MHz for 20 MHz); it sets up pins and
-    # peripheral anew and so lets go of SCK for a moment, hence only while CS is high. rp2 sets nothing
-    # but the divider, again to the next lower rate. Neither allocates. esp32 tears the whole bus down.
+    # peripheral again and so releases SCK for a moment; so call it only while CS is high. rp2 sets only
+    # the divider, also to the next lower rate. Neither allocates. esp32 closes the whole bus.
 
     @micropython.native
     def _clock(self, hz):
         if self.burst_hz:
-            self._hz = 0  # unknown, should it fail
+            self._hz = 0  # unknown if init() fails
             self._init(baudrate=hz)
             self._hz = hz
 
     def find_clocks(self):
-        """Let go of the chip and decide whether bursts get a clock of their own.
+        """Release the chip and decide whether bursts get their own clock.
 
-        They do where the bus changes its clock without allocating memory, in less time than that saves.
+        They do if the bus can change its clock without allocating, in less time than that saves.
         """
         self._cs(1)
         self.burst_hz = self._hz = 0
         try:
             self._init(baudrate=self.slow_hz)
-        except Exception:  # whatever a port raises where it has no such method or argument
+        except Exception:  # a port without this method or argument may raise anything
             return
         taken = self._try_clocks()
-        # a burst of 16 bytes must gain more than the way there and back costs
+        # a burst of 16 bytes must save more than both changes cost
         gain = 128_000_000 // self.slow_hz - 128_000_000 // self.fast_hz
         if 0 <= taken <= gain:
             self.burst_hz = self.fast_hz
@@ -205,7 +205,7 @@ class SPIRegisters(Registers):
         self._hz = self.slow_hz
 
     def _try_clocks(self):
-        """Microseconds for fast and back to slow without a heap, -1 if that cannot be."""
+        """Microseconds for a change to fast and back without heap; -1 if it allocates."""
         init = self._init
         fast, slow = self.fast_hz, self.slow_hz
         now = time.ticks_us
