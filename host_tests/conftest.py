@@ -18,8 +18,9 @@ for folder in (
 
 import histories  # noqa: E402
 import micropython  # noqa: E402, F401  (the shim: it prepares `time` before anything of lib/ is imported)
+import motions  # noqa: E402
 import pytest  # noqa: E402
-from upright_host import oled, rp2040, runtimes, simulate, trials  # noqa: E402
+from upright_host import oled, plotting, rp2040, runtimes, scoring, simulate, trials  # noqa: E402
 
 PORTABLE = Path(__file__).parent / "portable"
 
@@ -207,6 +208,15 @@ def upright():
 
 
 @pytest.fixture
+def figures(monkeypatch):
+    """The figures that were drawn, instead of files."""
+    pytest.importorskip("matplotlib")
+    drawn = []
+    monkeypatch.setattr(plotting, "save", lambda figure, path: drawn.append(figure))
+    return drawn
+
+
+@pytest.fixture
 def portable():
     """run(runtime, script, *args) -> what a script of host_tests/portable printed; its failure fails the test."""
 
@@ -228,7 +238,24 @@ def filter_history(portable, tmp_path):
     return run
 
 
-Boot = namedtuple("Boot", "result lines picture rows q29 times flags")
+class Boot(namedtuple("Boot", "result lines picture rows q29 times flags")):
+    """Of a run of the firmware on a simulated board: see boot_board."""
+
+    def score(self, motion, since_us=0, slack=0.0):
+        """The steps after since_us against the motion's truth."""
+        once = scoring.once(self.rows) & (self.times >= since_us)
+        num, den = motion.rate
+        t, q = self.rows[once] * den / num, self.q29[once] / scoring.ONE
+        return scoring.score(t, q, motion.t, motion.q_true, None, slack)
+
+
+@pytest.fixture(scope="session")
+def demo_world(tmp_path_factory):
+    """(its file, the motion): 12 s of the demo's at 1 kHz, with a typical sensor's errors."""
+    path = tmp_path_factory.mktemp("world") / "demo.imu"
+    motion = motions.render("demo", rate=(1000, 1), seconds=12)
+    motion.write(path, truth=True)
+    return path, motion
 
 
 @pytest.fixture

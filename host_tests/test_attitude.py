@@ -12,22 +12,14 @@ import motions
 import numpy as np
 import pytest
 from conftest import recorded_trials
-from test_inertial import FIELD_UT, scene
+from samples import SOFTWARE, Scales
+from scenes import FIELD_UT, scene
 from upright import filters
 from upright_host import scoring, trials, words
 from upright_host.simulate import best_runtime as quickest
 
-SOFTWARE = [name for name in filters.FILTERS if name not in filters.HARDWARE]
 AT_REST = array("h", [0, 0, 4096, 10, -20, 30, 66, 0, -150, 0, 3])
 RECORD = Path(__file__).parent / "golden" / "histories.json"
-
-
-class Scales:
-    """A driver, as far as a filter asks it."""
-
-    sample_rate = (200, 1)
-    gyro_scale = (82, 5)
-    accel_lsb_per_g = 4096
 
 
 @pytest.fixture(params=SOFTWARE)

@@ -3,11 +3,10 @@
 from itertools import pairwise
 
 import pytest
+from bare_bus import Bus, Ramp, Spi
 from chips.ist8310 import IST8310Chip
 from chips.mpu6050 import MPU6050Chip
 from chips.mpu6500 import MPU6500Chip
-from test_mpu6050_model import Bus, Ramp
-from test_mpu6500_model import Spi
 from world import StillWorld
 
 SMPLRT_DIV, FIFO_EN, I2C_MST_CTRL, INT_PIN_CFG, INT_ENABLE, INT_STATUS = (

@@ -9,6 +9,7 @@ import motions
 import numpy as np
 import pytest
 from conftest import require
+from pictures import line_of
 from trial_files import save
 from upright_host import (
     compare,
@@ -299,21 +300,6 @@ def _unavailable(name):
 
 
 # -- the pictures
-@pytest.fixture
-def figures(monkeypatch):
-    """The figures that were drawn, instead of files."""
-    pytest.importorskip("matplotlib")
-    drawn = []
-    monkeypatch.setattr(plotting, "save", lambda figure, path: drawn.append(figure))
-    return drawn
-
-
-def line_of(panel, k):
-    """What the k-th line of a panel shows, without its gaps."""
-    t, y = (np.asarray(v, float) for v in panel.get_lines()[k].get_data())
-    return t[np.isfinite(y)], y[np.isfinite(y)]
-
-
 def row(trial, name, q, measure=score.BEST):
     return score.Row(trial.name, name, measure, scoring.score_trial(q, trial), q, int(name[-1]))
 

@@ -14,6 +14,7 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from reference.complementary_float import EulerFloat
 from reference.mahony_float import angle_between
+from samples import counts, run
 from upright import euler_kernels
 from upright.complementary import Euler6
 from upright.mahony import Mahony6
@@ -28,10 +29,6 @@ LIMIT_DEG = 0.01
 NEAR_THE_POLE_DEG = {("bursts", 100): 0.5}
 
 
-def counts(ax=0, ay=0, az=4096, gx=0, gy=0, gz=0, flags=1):
-    return array("h", [ax, ay, az, gx, gy, gz, 0, 0, 0, 0, flags])
-
-
 def degrees(filter):
     """Roll, pitch and yaw of the state."""
     return [v * 360 / TURN for v in filter.state[AT.A : AT.A + 3]]
@@ -40,11 +37,6 @@ def degrees(filter):
 def turned(angle):
     """Degrees into -180..180."""
     return (angle + 180) % 360 - 180
-
-
-def run(filter, row, n):
-    for _ in range(n):
-        filter.update(row)
 
 
 @pytest.fixture

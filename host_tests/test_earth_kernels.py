@@ -8,7 +8,7 @@ import motions
 import numpy as np
 import pytest
 from histories import ONE, SCALE, SCALES
-from test_inertial import PACES, all_axes, as_start, errors, pushes, scene
+from scenes import PACES, all_axes, as_start, errors, pushes, scene
 from upright import earth_kernels
 from upright.inertial import Inertial9
 from upright.quaternion_kalman import QuaternionKalman9

@@ -12,6 +12,8 @@ import pytest
 from conftest import recorded_trials
 from histories import ONE, SCALE, SCALES, angles_between, rows_of
 from reference import inertial_float
+from samples import counts, run
+from scenes import PACES, all_axes, errors, scene
 from upright.inertial import Inertial6, Inertial9, Inertial9Lite
 from upright_host import paths, scoring, trials, words
 from upright_host.simulate import best_runtime as quickest
@@ -20,8 +22,6 @@ LIB = paths.PACKAGE
 AT = words.places("inertial")
 APART_DEG = 0.1
 TOTAL_APART_DEG = 0.05
-# (rate, every so many samples with a fresh magnetometer)
-PACES = [(90, 1), (200, 3), (500, 10)]
 
 
 def called(axes, lite=False):
@@ -126,85 +126,6 @@ def test_six_axes_on_the_static_trial_hold_their_heading(history):
     assert scoring.score_trial(q, trial).inclination < 0.1
     settled = q[int(5 * trial.rate[0] / trial.rate[1]) :]
     assert angles_between(settled, settled[:1]).max() < 1  # 650 s
-
-
-# -- scenes: motion, errors and events of one's own making
-FIELD_UT = motions.FIELD_UT * np.array(
-    [math.cos(math.radians(motions.DIP_DEG)), 0, -math.sin(math.radians(motions.DIP_DEG))]
-)
-
-
-def scene(
-    rate,
-    seconds,
-    body_rate=None,
-    accel=None,
-    bias_dps=(1.2, -0.8, 0.6),
-    kick=None,
-    field=None,
-    range_g=16,
-    mag_every=1,
-    accel_offset_g=(0.004, -0.003, 0.006),
-):
-    """A motion from level and north as the counts of a noisy sensor, flags included.
-
-    body_rate(t): deg/s (n, 3); accel(t): g, earth (n, 3); field(t): uT on top, earth (n, 3); kick: (s, rotation vector
-    in deg, earth): the body is elsewhere from then on, and the gyro has not seen it.
-    """
-    n = int(rate * seconds)
-    t = np.arange(n) / rate
-    still = np.zeros((n, 3))
-    q, gyro = motions._integrate(
-        np.array([1.0, 0, 0, 0]),
-        body_rate or (lambda t: np.zeros((len(t), 3))),
-        t,
-        1 / rate,
-        max(1, 2000 // rate),
-    )
-    if kick:
-        late = t >= kick[0]
-        q[late] = motions.multiply(
-            motions.exponential(np.radians(np.array(kick[1], float))), q[late]
-        )
-    turn = motions._matrix(q)
-    force = np.einsum("nij,ni->nj", turn, (accel(t) if accel else still) + [0, 0, 1])
-    mag = np.einsum("nij,ni->nj", turn, FIELD_UT + (field(t) if field else still))
-    rng = np.random.default_rng(1)
-    gyro = gyro + np.array(bias_dps) + 0.07 * rng.standard_normal((n, 3))
-    force = force + accel_offset_g + 0.005 * rng.standard_normal((n, 3))
-    mag = mag + 0.6 * rng.standard_normal((n, 3))
-    counts = np.zeros((n, 11), np.int16)
-    counts[:, 0:3] = motions._to_int16(force * (32768 // range_g))
-    counts[:, 3:6] = motions._to_int16(gyro * 16.4)
-    counts[:, 6:9] = motions._to_int16(mag / 0.3)
-    full = (np.abs(counts[:, 0:3].astype(int)) >= 32767).any(1)
-    counts[:, 10] = np.where(np.arange(n) % mag_every == 0, 3, 1) + 4 * full
-    return motions.Motion("scene", counts, q, gyro, (rate, 1), 32768 // range_g, SCALE)
-
-
-def errors(q, rendered):
-    """(inclination, heading) errors in degrees, each (n,)."""
-    e = motions.multiply(q, rendered.q_true * [1, -1, -1, -1])
-    inclination = np.degrees(2 * np.arccos(np.clip(np.hypot(e[:, 0], e[:, 3]), 0, 1)))
-    heading = np.degrees(2 * np.arctan2(e[:, 3], e[:, 0]))
-    return inclination, (heading + 180) % 360 - 180
-
-
-def all_axes(t):
-    w = 2 * np.pi * t
-    return np.stack(
-        [60 * np.sin(0.31 * w), 50 * np.sin(0.23 * w + 1), 70 * np.sin(0.17 * w + 2)], 1
-    )
-
-
-def pushes(t):
-    w = 2 * np.pi * t
-    return np.stack([0.2 * np.sin(1.3 * w), 0.2 * np.sin(0.9 * w), 0.15 * np.sin(1.7 * w)], 1)
-
-
-def as_start(axis, degrees):
-    q = motions.exponential(math.radians(degrees) * np.array(axis) / np.linalg.norm(axis))
-    return [round(v * ONE) for v in q]
 
 
 # -- start and recovery
@@ -438,15 +359,6 @@ def test_nothing_leaves_32_bits_at_the_corners_of_the_accepted_range(checked):
 
 
 # -- interface
-def counts(ax=0, ay=0, az=4096, gx=0, gy=0, gz=0, mx=66, my=0, mz=-150, flags=1):
-    return array("h", [ax, ay, az, gx, gy, gz, mx, my, mz, 0, flags])
-
-
-def run(filter, row, n):
-    for _ in range(n):
-        filter.update(row)
-
-
 def test_it_coasts_on_the_last_gyro_words_without_feedback():
     filter = Inertial9(200, SCALE, 4096)
     run(filter, counts(flags=3), 200 * 4)

@@ -3,8 +3,8 @@
 import kernel
 import machine
 import pytest
+from bare_bus import Bus, Nack
 from chips.ist8310 import IST8310Chip
-from test_mpu6050_model import Bus, Nack
 from world import StillWorld
 
 WAI, STAT1, DATAXL, STAT2, CNTL1, CNTL2, STR, CNTL3 = 0, 2, 3, 9, 0x0A, 0x0B, 0x0C, 0x0D

@@ -15,6 +15,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from reference.kalman_float import KalmanFloat, PerAngleFloat, ScalarFloat
 from reference.mahony_float import angle_between
+from samples import counts, run
 from upright import complementary, kalman
 from upright.complementary import Euler6
 from upright.kalman import Kalman6, KalmanFilter
@@ -324,15 +325,6 @@ def test_the_gains_of_the_docstring():
 
 
 # -- the attitude filter
-def counts(ax=0, ay=0, az=4096, gx=0, gy=0, gz=0, flags=1):
-    return array("h", [ax, ay, az, gx, gy, gz, 0, 0, 0, 0, flags])
-
-
-def run(filter, row, n):
-    for _ in range(n):
-        filter.update(row)
-
-
 def bias_dps(filter):
     out = array("i", [0] * 3)
     filter.bias_mdps(out)

@@ -12,6 +12,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from reference import mahony_float
 from reference.mahony_float import MahonyFloat
+from samples import counts, run
 from upright import mahony
 from upright.mahony import Mahony6
 from upright_host import trials, words
@@ -20,10 +21,6 @@ from upright_host.simulate import best_runtime as quickest
 AT = words.places("mahony")
 GAINS = [(0.5, 0), (1, 0.02)]
 LIMIT_DEG = 0.01
-
-
-def counts(ax=0, ay=0, az=4096, gx=0, gy=0, gz=0, flags=1):
-    return array("h", [ax, ay, az, gx, gy, gz, 0, 0, 0, 0, flags])
 
 
 def float_history(rendered, kp, ki, bias=None, **options):
@@ -169,11 +166,6 @@ def test_a_bias_is_subtracted_to_a_256th_of_a_count():
 
 
 # -- feedback
-def run(filter, row, n):
-    for _ in range(n):
-        filter.update(row)
-
-
 def test_it_levels_from_a_wrong_start_with_the_time_constant_of_kp():
     filter = Mahony6(200, SCALE, 4096, kp=2)
     filter.set_quaternion(math.cos(0.1), math.sin(0.1), 0, 0)

@@ -3,6 +3,7 @@
 from itertools import pairwise
 
 import pytest
+from bare_bus import COUNTS, Bus, Nack, Ramp
 from chips.mpu6050 import MPU6050Chip
 from world import StillWorld
 
@@ -10,49 +11,7 @@ SMPLRT_DIV, CONFIG, GYRO_CONFIG, ACCEL_CONFIG = 0x19, 0x1A, 0x1B, 0x1C
 FIFO_EN, INT_PIN_CFG, INT_ENABLE, INT_STATUS = 0x23, 0x37, 0x38, 0x3A
 ACCEL_XOUT_H, USER_CTRL, PWR_MGMT_1, PWR_MGMT_2 = 0x3B, 0x6A, 0x6B, 0x6C
 FIFO_COUNTH, FIFO_COUNTL, FIFO_R_W, WHO_AM_I = 0x72, 0x73, 0x74, 0x75
-COUNTS = (10, -20, 4096, 5, 6, -7, 0, 0, 0, -521)
 WORDS = [10, -20, 4096, -521, 5, 6, -7]  # as they lie in 0x3B..0x48
-
-
-class Nack(Exception):
-    pass
-
-
-class Bus:
-    """Whole transfers on one chip, at a time that only the test moves."""
-
-    def __init__(self, chip):
-        self.chip = chip
-        self.now = 0
-
-    def write(self, register, *values):
-        self._address(False)
-        for byte in (register, *values):
-            self._acknowledged(self.chip.i2c_write(byte, self.now))
-        self.chip.i2c_stop(self.now)
-
-    def read(self, register, n=1, us_per_byte=0):
-        self._address(False)
-        self._acknowledged(self.chip.i2c_write(register, self.now))
-        self._address(True)
-        data = bytearray()
-        for _ in range(n):
-            data.append(self.chip.i2c_read(self.now))
-            self.now += us_per_byte
-        self.chip.i2c_stop(self.now)
-        return data[0] if n == 1 else bytes(data)
-
-    def words(self):
-        data = self.read(ACCEL_XOUT_H, 14)
-        return [int.from_bytes(data[i : i + 2], "big", signed=True) for i in range(0, 14, 2)]
-
-    def _address(self, read):
-        self._acknowledged(self.chip.i2c_start(read, self.now))
-
-    def _acknowledged(self, ack):
-        if not ack:
-            self.chip.i2c_stop(self.now)
-            raise Nack
 
 
 def running(world=None, divider=0, dlpf=1, settled=True, **options):
@@ -64,17 +23,6 @@ def running(world=None, divider=0, dlpf=1, settled=True, **options):
     if settled:
         bus.now += 100_000
     return bus
-
-
-class Ramp(StillWorld):
-    """Row k holds k in every word; `clocked` rows at 1 kHz."""
-
-    def __init__(self, n=1 << 20, clocked=True, rate=(1000, 1)):
-        super().__init__((), rate, clocked=clocked, n=n)
-
-    def row(self, k):
-        self.set([k % 32768] * 10)
-        return self._row
 
 
 # Reset and identity

@@ -5,8 +5,8 @@ from itertools import pairwise
 import kernel
 import machine
 import pytest
+from bare_bus import COUNTS, Bus, Nack, Ramp, Spi
 from chips.mpu6500 import MPU6500Chip
-from test_mpu6050_model import COUNTS, Bus, Nack, Ramp
 from world import StillWorld
 
 SELF_TEST_X_GYRO, SELF_TEST_X_ACCEL = 0x00, 0x0D
@@ -16,37 +16,6 @@ SIGNAL_PATH_RESET, USER_CTRL, PWR_MGMT_1 = 0x68, 0x6A, 0x6B
 FIFO_COUNTH, FIFO_R_W, WHO_AM_I, XA_OFFSET_H = 0x72, 0x74, 0x75, 0x77
 I2C_IF_DIS = 0x10
 WORDS = [10, -20, 4096, (-521 * 33387 // 34000) + 5182, 5, 6, -7]  # as they lie in 0x3B..0x48
-
-
-class Spi:
-    """Whole transactions on one chip, at a time that only the test moves."""
-
-    def __init__(self, chip, hz=1_000_000, mode=0):
-        self.chip = chip
-        self.now = 0
-        self.hz = hz
-        self.mode = mode
-
-    def transfer(self, *values, hz=None, mode=None, us_per_byte=0):
-        hz, mode = hz or self.hz, self.mode if mode is None else mode
-        self.chip.spi_select(True, self.now)
-        answer = bytearray()
-        for value in values:
-            self.now += us_per_byte
-            answer.append(self.chip.spi_transfer(value, self.now, hz, mode))
-        self.chip.spi_select(False, self.now)
-        return bytes(answer)
-
-    def write(self, register, *values, **options):
-        self.transfer(register, *values, **options)
-
-    def read(self, register, n=1, **options):
-        data = self.transfer(0x80 | register, *bytes(n), **options)[1:]
-        return data[0] if n == 1 else data
-
-    def words(self):
-        data = self.read(ACCEL_XOUT_H, 14)
-        return [int.from_bytes(data[i : i + 2], "big", signed=True) for i in range(0, 14, 2)]
 
 
 def reset(bus):

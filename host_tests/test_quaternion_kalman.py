@@ -13,9 +13,11 @@ from conftest import recorded_trials
 from histories import ONE, SCALE, SCALES, angles_between, rows_of
 from reference import quaternion_kalman_float
 from reference.inertial_float import start
-from test_inertial import all_axes, as_start, errors, pushes, quickest, scene
+from samples import counts, run
+from scenes import all_axes, as_start, errors, pushes, scene
 from upright.quaternion_kalman import QuaternionKalman6, QuaternionKalman9
 from upright_host import paths, scoring, trials, words
+from upright_host.simulate import best_runtime as quickest
 
 LIB = paths.PACKAGE
 AT = words.places("quaternion_kalman")
@@ -437,15 +439,6 @@ def test_nothing_leaves_32_bits_at_the_corners_of_the_accepted_range(checked):
 
 
 # -- interface
-def counts(ax=0, ay=0, az=4096, gx=0, gy=0, gz=0, mx=66, my=0, mz=-150, flags=1):
-    return array("h", [ax, ay, az, gx, gy, gz, mx, my, mz, 0, flags])
-
-
-def run(filter, row, n):
-    for _ in range(n):
-        filter.update(row)
-
-
 def test_it_coasts_on_the_last_gyro_words_without_feedback():
     filter = QuaternionKalman9(200, SCALE, 4096)
     run(filter, counts(flags=3), 200 * 4)

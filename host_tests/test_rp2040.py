@@ -18,8 +18,9 @@ from chips.mpu6050 import MPU6050Chip
 from chips.mpu6500 import MPU6500Chip
 from chips.ssd1306 import SSD1306Chip
 from rich.console import Console
+from trial_files import as_trial
 from upright_host import bench as bench_command
-from upright_host import console, emulated, paths, replay, runtimes, scoring, tracing, trials
+from upright_host import console, emulated, paths, replay, runtimes, scoring, tracing
 from upright_host import rp2040 as firmware
 from world import StillWorld, World
 
@@ -284,22 +285,6 @@ def test_ticks_that_are_kept_from_coming_are_missed(landed):
 
 
 # ---------------------------------------------------------------- replay
-def as_trial(motion):
-    """A rendered motion as a recorded trial without a truth."""
-    return trials.Trial(
-        name=motion.name,
-        counts=motion.counts,
-        rate=motion.rate,
-        accel_lsb_per_g=motion.accel_lsb_per_g,
-        gyro_scale=motion.gyro_scale,
-        mag_uT_per_lsb=None,
-        gt_every=None,
-        q_gt=None,
-        movement=None,
-        header={},
-    )
-
-
 def test_a_replay_on_the_board_writes_the_bytes_that_cpython_writes(image, tmp_path, monkeypatch):
     """Through the chip's registers, the driver and the tick, in the data-ready line's hard interrupt."""
     import motions

@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 import pytest
-from test_compare import figures, line_of  # noqa: F401 (figures: a fixture)
+from pictures import line_of
 from trial_files import save
 from upright_host import kalman_scan, plotting, trials, tune
 
@@ -199,7 +199,7 @@ def test_without_matplotlib_there_is_a_table_and_one_clear_line(run, tmp_path, m
 
 
 # -- the pictures
-def test_the_scans_picture_shows_the_grid_and_four_waves(figures, monkeypatch):  # noqa: F811
+def test_the_scans_picture_shows_the_grid_and_four_waves(figures, monkeypatch):
     signal = walk(0.02, 1500)
     found = kalman_scan.scan(signal, kalman_scan.grid(), jobs=1)
     tune.draw_scan(signal, found, "walk", "none.png")
@@ -217,7 +217,7 @@ def test_the_scans_picture_shows_the_grid_and_four_waves(figures, monkeypatch): 
     assert line_of(still, 0)[0][0] == signal.rest.start / HZ
 
 
-def test_the_waveform_shows_what_is_filtered_and_how_k_and_p_settle(tmp_path, figures):  # noqa: F811
+def test_the_waveform_shows_what_is_filtered_and_how_k_and_p_settle(tmp_path, figures):
     trial = trials.load(save(tmp_path / "hand.npz", seconds=6))
     tune.draw_waveform(trial, "none.png")
     wide, zoom, still, K, P = figures[0].axes
@@ -242,7 +242,7 @@ def still_usual(panel):
     return len(panel.get_lines()) - 2
 
 
-def test_a_trial_without_a_truth_has_a_waveform_too(tmp_path, figures):  # noqa: F811
+def test_a_trial_without_a_truth_has_a_waveform_too(tmp_path, figures):
     trial = trials.load(save(tmp_path / "t.npz", seconds=2, without=("q_gt", "movement")))
     tune.draw_waveform(trial, "none.png")
     labels = [line.get_label() for line in figures[0].axes[0].get_lines()]

@@ -10,6 +10,22 @@ from upright_host import scoring, trials
 EVERY = 4
 
 
+def as_trial(motion):
+    """A rendered motion as a recorded trial without a truth."""
+    return trials.Trial(
+        name=motion.name,
+        counts=motion.counts,
+        rate=motion.rate,
+        accel_lsb_per_g=motion.accel_lsb_per_g,
+        gyro_scale=motion.gyro_scale,
+        mag_uT_per_lsb=None,
+        gt_every=None,
+        q_gt=None,
+        movement=None,
+        header={},
+    )
+
+
 def save(path, motion="hand", rate=100, seconds=4.0, without=(), unknown_s=0, **header):
     """A trial of a synthetic motion, as recorded ones are kept; its truth counts from 1 s on."""
     made = motions.render(motion, rate=(rate, 1), seconds=seconds)

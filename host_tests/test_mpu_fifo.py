@@ -9,6 +9,7 @@ import machine
 import pytest
 from chips.mpu6050 import MPU6050Chip
 from chips.mpu6500 import MPU6500Chip
+from hostile import Hostile, plans
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from upright.mpu6050 import HEALTH_OK, MPU6050
@@ -217,55 +218,6 @@ def test_a_batch_that_the_fifo_cannot_hold_is_refused(batch):
         imu.fifo_enable(batch)
 
 
-class Hostile:
-    """A bus on which anything may happen: `plan` has, for each transaction in turn, (delay before
-    it, per byte, fault).
-
-    fault: None; ("nack", n) refuses the n-th acknowledge; ("cut", n) fails after n bytes read;
-    ("brown", n) lets the supply dip before byte n of a read.
-    """
-
-    def __init__(self, chip, now, plan):
-        self.chip, self.now, self.plan = chip, now, list(plan)
-
-    def _begin(self):
-        delay, per_byte, fault = self.plan.pop() if self.plan else (500, 25, None)
-        self.now += delay
-        self.per_byte = per_byte
-        kind, n = fault or (None, 0)
-        if kind == "nack":
-            self.chip.nack_next(1, after=n)
-        return kind, n
-
-    def _sent(self, ack):
-        self.now += self.per_byte
-        if not ack:
-            self.chip.i2c_stop(self.now)
-            raise OSError(5)
-
-    def readfrom_mem_into(self, address, register, buffer):
-        kind, n = self._begin()
-        self._sent(self.chip.i2c_start(False, self.now))
-        self._sent(self.chip.i2c_write(register, self.now))
-        self._sent(self.chip.i2c_start(True, self.now))
-        for i in range(len(buffer)):
-            if kind == "cut" and i == n:
-                self.chip.i2c_stop(self.now)
-                raise OSError(110)
-            if kind == "brown" and i == n:
-                self.chip.brown_out(self.now)
-            buffer[i] = self.chip.i2c_read(self.now)
-            self.now += self.per_byte
-        self.chip.i2c_stop(self.now)
-
-    def writeto(self, address, buffer):
-        self._begin()
-        self._sent(self.chip.i2c_start(False, self.now))
-        for byte in buffer:
-            self._sent(self.chip.i2c_write(byte, self.now))
-        self.chip.i2c_stop(self.now)
-
-
 def test_a_burst_cut_off_and_a_restart_that_fails_too_leave_no_half_packet_behind():
     chip, imu = running()
     bus = Hostile(chip, kernel.now() + 5000, [])
@@ -280,17 +232,6 @@ def test_a_burst_cut_off_and_a_restart_that_fails_too_leave_no_half_packet_behin
         bus.now += 2000
         numbers += drain(imu)
     assert before and consecutive(numbers) and numbers[0] > before[-1]
-
-
-delays = st.one_of(st.integers(0, 3000), st.integers(60_000, 90_000), st.integers(0, 300_000))
-faults = st.one_of(
-    st.none(),
-    st.none(),
-    st.tuples(st.just("nack"), st.integers(0, 3)),
-    st.tuples(st.just("cut"), st.integers(0, 112)),
-    st.tuples(st.just("brown"), st.integers(0, 112)),
-)
-plans = st.lists(st.tuples(delays, st.sampled_from([0, 25, 300]), faults), max_size=40)
 
 
 @given(

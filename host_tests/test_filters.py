@@ -5,13 +5,12 @@ import hashlib
 import sys
 
 import dmp_images
-import motions
 import numpy as np
 import pytest
 from conftest import healthy
-from test_attitude import SOFTWARE, Scales
-from test_inertial import errors, scene
-from test_rp2040 import as_trial
+from samples import SOFTWARE, Scales
+from scenes import errors, scene
+from trial_files import as_trial
 from upright import filters
 from upright_host import registry, replay, scoring, simulate
 
@@ -33,17 +32,9 @@ def test_no_samples_can_be_handed_to_a_filter_in_the_sensor():
 
 
 # -- the firmware with each of them
-@pytest.fixture(scope="module")
-def hand(tmp_path_factory):
-    motion = motions.render("demo", rate=(1000, 1), seconds=7)
-    path = tmp_path_factory.mktemp("world") / "demo.imu"
-    motion.write(path, truth=True)
-    return motion, path
-
-
 @pytest.mark.parametrize("name", SOFTWARE)
-def test_the_firmware_runs_with_it_and_nothing_is_allocated(boot_board, hand, name):
-    motion, path = hand
+def test_the_firmware_runs_with_it_and_nothing_is_allocated(boot_board, demo_world, name):
+    path, motion = demo_world
     nine = registry.axes(name) == 9
     boot = boot_board(
         world=str(path),
@@ -56,10 +47,7 @@ def test_the_firmware_runs_with_it_and_nothing_is_allocated(boot_board, hand, na
     assert boot.result["missed"] == 0 and boot.result["steps"] > 800
     if boot.result["heap_checked"]:
         assert boot.result["irqs"] >= boot.result["steps"]
-    rows = scoring.once(boot.rows)
-    score = scoring.score(
-        boot.rows[rows] / 1000, boot.q29[rows] / scoring.ONE, motion.t, motion.q_true, None, 0.0005
-    )
+    score = boot.score(motion, slack=0.0005)
     assert score.inclination < 2.5
     assert (score.total if nine else score.aligned_total) < 4
 
@@ -73,18 +61,15 @@ def dmp_board(tmp_path, image, **board):
 
 @pytest.mark.parametrize("version", dmp_images.IMAGES)
 @pytest.mark.parametrize("rate", [200, 50])
-def test_the_firmware_shows_what_the_dmp_says(boot_board, hand, tmp_path, version, rate):
-    motion, path = hand
+def test_the_firmware_shows_what_the_dmp_says(boot_board, demo_world, tmp_path, version, rate):
+    path, motion = demo_world
     config = dmp_board(tmp_path, dmp_images.IMAGES[version], RATE=rate)
     boot = boot_board(world=str(path), seconds=7, **config)
     healthy(boot.result)
     assert boot.result["filter"] == "dmp6"
     assert f"dmp: image {version}" in "\n".join(boot.lines)
     assert boot.result["fresh"] > 5 * rate
-    rows = scoring.once(boot.rows)
-    score = scoring.score(
-        boot.rows[rows] / 1000, boot.q29[rows] / scoring.ONE, motion.t, motion.q_true, None, 0.0005
-    )
+    score = boot.score(motion, slack=0.0005)
     # between two packets the attitude is as old as that
     assert score.aligned_total < (0.5 if rate == 200 else 3)
 
@@ -98,10 +83,10 @@ def test_the_firmware_shows_what_the_dmp_says(boot_board, hand, tmp_path, versio
     ids=["brown-out", "gone for a while"],
 )
 def test_a_dmp_that_lost_its_program_gets_it_again_and_the_display_lives_on(
-    boot_board, hand, tmp_path, runtime, faults
+    boot_board, demo_world, tmp_path, runtime, faults
 ):
     config = dmp_board(tmp_path, dmp_images.V612)
-    boot = boot_board(runtime, world=str(hand[1]), seconds=5, faults=faults, **config)
+    boot = boot_board(runtime, world=str(demo_world[0]), seconds=5, faults=faults, **config)
     healthy(boot.result)
     assert boot.result["resets"] == 1
     assert "dmp: loaded again" in boot.lines

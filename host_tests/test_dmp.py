@@ -15,9 +15,9 @@ import overflow
 import pytest
 from chips.mpu6050 import MPU6050Chip
 from dmp_images import IMAGES, LIST, V20, V612, running, ticks, wired
+from hostile import Hostile, plans
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_fifo import Hostile, plans
 from upright import dmp as mpu_dmp
 from upright.dmp import MpuDmp, MpuDmpError
 from upright.mpu6050 import MPU6050, MPU6050Error

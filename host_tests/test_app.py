@@ -3,64 +3,48 @@
 Every run is a process of its own on a runtime; faults are put in at their simulated time.
 """
 
+import motions
 import numpy as np
 import pytest
 from conftest import healthy
+from upright import calibration
 from upright_host import demo, scoring, simulate
+from world import write_imu
 
 SECOND = 1000000
 
 
-@pytest.fixture(scope="module")
-def world(tmp_path_factory):
-    """The demo's motion: 12 s of it, at 1 kHz, with a typical sensor's errors."""
-    import motions
-
-    path = tmp_path_factory.mktemp("world") / "demo.imu"
-    motion = motions.render("demo", rate=(1000, 1), seconds=12)
-    motion.write(path)
-    return path, motion
-
-
 @pytest.fixture
-def boot(boot_board, world):
-    """boot(**config) -> (result, console lines, last picture as rows, world rows, attitudes Q29)."""
+def boot(boot_board, demo_world):
+    """boot(**config) -> Boot, in the demo's world where no other is asked for."""
 
     def run(runtime=None, **config):
-        return boot_board(runtime, **({"world": str(world[0])} | config))[:5]
+        return boot_board(runtime, **({"world": str(demo_world[0])} | config))
 
     return run
-
-
-def error_deg(world, rows, q29):
-    """Inclination and aligned total RMSE against the truth."""
-    motion = world[1]
-    once = scoring.once(rows)
-    score = scoring.score(rows[once] / 1000, q29[once] / scoring.ONE, motion.t, motion.q_true)
-    return score.inclination, score.aligned_total
 
 
 def dark(picture):
     return not any(any(row) for row in picture)
 
 
-def test_it_boots_and_is_right_on_every_runtime_with_the_same_bits(runtime, boot, world):
-    result, lines, picture, rows, q29 = boot(runtime, seconds=6)
-    healthy(result)
-    assert result["missed"] == result["errors"] == 0
-    assert result["bias_known"]
-    assert result["ticker"] == "machine.Timer, hard"
-    assert abs(result["steps"] - 200 * (6 - rows[0] / 1000)) <= 2
-    inclination, total = error_deg(world, rows, q29)
-    assert inclination < 0.6
-    assert total < 1.0
-    assert any("MPU6050" in line for line in lines)
-    assert not dark(picture)
+def test_it_boots_and_is_right_on_every_runtime_with_the_same_bits(runtime, boot, demo_world):
+    run = boot(runtime, seconds=6)
+    healthy(run.result)
+    assert run.result["missed"] == run.result["errors"] == 0
+    assert run.result["bias_known"]
+    assert run.result["ticker"] == "machine.Timer, hard"
+    assert abs(run.result["steps"] - 200 * (6 - run.rows[0] / 1000)) <= 2
+    score = run.score(demo_world[1])
+    assert score.inclination < 0.6
+    assert score.aligned_total < 1.0
+    assert any("MPU6050" in line for line in run.lines)
+    assert not dark(run.picture)
     if runtime != "cpython":
-        _, _, picture_there, rows_there, q29_there = boot("cpython", seconds=6)
-        assert (rows == rows_there).all()
-        assert (q29 == q29_there).all()
-        assert picture == picture_there
+        there = boot("cpython", seconds=6)
+        assert (run.rows == there.rows).all()
+        assert (run.q29 == there.q29).all()
+        assert run.picture == there.picture
 
 
 @pytest.mark.parametrize("own_bus", [False, True], ids=["shared", "separate"])
@@ -81,14 +65,12 @@ def test_a_display_written_by_the_main_program_on_the_sensors_bus_cuts(boot):
     assert result["cuts"] > 0
 
 
-def test_1_khz_with_a_display_on_its_own_bus(boot, world):
-    result, _, _, rows, q29 = boot(
-        seconds=5, board={"RATE": 1000, "DISPLAY_SHARES_BUS": False}, irq_cost_us=200
-    )
-    healthy(result)
-    assert result["missed"] == 0
-    assert result["steps"] > 3000
-    assert error_deg(world, rows, q29)[0] < 0.6
+def test_1_khz_with_a_display_on_its_own_bus(boot, demo_world):
+    run = boot(seconds=5, board={"RATE": 1000, "DISPLAY_SHARES_BUS": False}, irq_cost_us=200)
+    healthy(run.result)
+    assert run.result["missed"] == 0
+    assert run.result["steps"] > 3000
+    assert run.score(demo_world[1]).inclination < 0.6
 
 
 def test_a_tick_that_takes_longer_than_its_period_is_noticed(boot):
@@ -105,20 +87,20 @@ def test_a_tick_that_takes_longer_than_its_period_is_noticed(boot):
     ],
     ids=["data_ready", "fifo"],
 )
-def test_the_other_drives_are_as_right(boot, world, drive):
-    result, _, _, rows, q29 = boot(seconds=10, board=drive)
-    healthy(result)
-    assert result["missed"] == 0
-    assert result["fifo_overflows"] == 0
+def test_the_other_drives_are_as_right(boot, demo_world, drive):
+    run = boot(seconds=10, board=drive)
+    healthy(run.result)
+    assert run.result["missed"] == 0
+    assert run.result["fifo_overflows"] == 0
     if drive["DRIVE"] == "data_ready":
-        inclination, total = error_deg(world, rows, q29)
-        assert inclination < 0.6
-        assert total < 1.0
+        score = run.score(demo_world[1])
+        assert score.inclination < 0.6
+        assert score.aligned_total < 1.0
     else:
         # several packets a tick: the last one is the newest sample; only the end is compared
-        assert abs(result["steps"] / 200 - (10 - rows[0] / 1000)) < 0.3
-        q = q29[-1] / scoring.ONE
-        true = world[1].q_true[rows[-1]]
+        assert abs(run.result["steps"] / 200 - (10 - run.rows[0] / 1000)) < 0.3
+        q = run.q29[-1] / scoring.ONE
+        true = demo_world[1].q_true[run.rows[-1]]
         assert abs(np.degrees(2 * np.arccos(min(1, abs(q @ true))))) < 3
 
 
@@ -148,10 +130,10 @@ def test_a_wrong_chip_is_named_with_what_it_answered(boot):
 
 
 @pytest.mark.parametrize("identity", [0x70, 0x71, 0x98])
-def test_the_clones_work(boot, world, identity):
-    result, _, _, rows, q29 = boot(who_am_i=identity, seconds=6)
-    healthy(result)
-    assert error_deg(world, rows, q29)[0] < 0.6
+def test_the_clones_work(boot, demo_world, identity):
+    run = boot(who_am_i=identity, seconds=6)
+    healthy(run.result)
+    assert run.score(demo_world[1]).inclination < 0.6
 
 
 def test_it_goes_on_without_a_display_and_with_one_that_appears(boot):
@@ -175,7 +157,7 @@ def test_a_display_that_loses_its_power_for_a_moment_is_lit_again(boot):
     assert not dark(picture)
 
 
-def test_a_sensor_that_stops_answering_is_counted_coasted_and_back_again(boot, world):
+def test_a_sensor_that_stops_answering_is_counted_coasted_and_back_again(boot):
     result, *_ = boot(
         seconds=8,
         faults=[[3 * SECOND, "imu", "vanish"], [int(3.1 * SECOND), "imu", "come_back"]],
@@ -186,12 +168,12 @@ def test_a_sensor_that_stops_answering_is_counted_coasted_and_back_again(boot, w
     assert result["fresh"] < result["steps"]
 
 
-def test_nacks_in_the_middle_of_bursts_are_survived(boot, world):
+def test_nacks_in_the_middle_of_bursts_are_survived(boot, demo_world):
     faults = [[2 * SECOND + 37000 * i, "imu", "nack_next", 1, i % 3] for i in range(60)]
-    result, _, _, rows, q29 = boot(seconds=6, faults=faults)
-    healthy(result)
-    assert result["errors"] >= 50
-    assert error_deg(world, rows, q29)[0] < 0.7
+    run = boot(seconds=6, faults=faults)
+    healthy(run.result)
+    assert run.result["errors"] >= 50
+    assert run.score(demo_world[1]).inclination < 0.7
 
 
 @pytest.mark.parametrize("drive", ["timer", "data_ready", "fifo"])
@@ -276,8 +258,6 @@ def test_every_kind_of_fault_is_in_the_count_that_the_display_shows(boot, kind, 
 @pytest.mark.parametrize(("counts", "known"), [(327, True), (331, False)])
 def test_a_bias_that_no_sensor_has_is_taken_for_motion(boot, tmp_path, counts, known):
     """PS 6.1: the zero-rate output is within 20 deg/s, 328 counts."""
-    from world import write_imu
-
     path = tmp_path / "turning.imu"
     row = np.array([0, 0, 4096, counts, -counts, counts, 0, 0, 0, 0, 0], "<i2")
     write_imu(path, row.tobytes() * 2, "turning", (1, 2), 4096, (82, 5), False)
@@ -287,8 +267,6 @@ def test_a_bias_that_no_sensor_has_is_taken_for_motion(boot, tmp_path, counts, k
 
 
 def test_a_board_that_never_rests_goes_on_flagged(boot, tmp_path):
-    import motions
-
     path = tmp_path / "hand.imu"
     motions.render("spin", rate=(1000, 1), seconds=8).write(path)
     result, lines, *_ = boot(world=str(path), seconds=8)
@@ -339,7 +317,7 @@ def test_a_setting_that_cannot_be_had_stops_the_start_with_a_reason(boot, settin
         boot(board=settings)
 
 
-def test_the_demo_is_as_good_as_it_says(world):
+def test_the_demo_is_as_good_as_it_says():
     source = demo.motion_source("demo", 10)
     outcome = demo.run(source, simulate.best_runtime())
     assert outcome.score.inclination < 0.6
@@ -347,3 +325,79 @@ def test_the_demo_is_as_good_as_it_says(world):
     text = "\n".join(demo.summary(outcome))
     assert "RMSE" in text
     assert "missed 0" in text
+
+
+# -- a filter that learns the bias: nobody waits for it, the status page shows it, and the next start has it
+INERTIAL = {"FILTER": "inertial6", "PAGE_SECONDS": 0}
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory):
+    """25 s of rest with a typical sensor's errors: a bias of 1.2, -0.8, 0.6 deg/s."""
+    path = tmp_path_factory.mktemp("world") / "still.imu"
+    motions.render("static", rate=(200, 1), seconds=25).write(path)
+    return path
+
+
+def bias_of(flash):
+    fields = calibration.read(str(flash / "upright_cal.json"))
+    return [v / 1e6 for v in fields["gyro_bias_udps"]]
+
+
+def test_at_rest_it_is_kept_once_and_used_at_the_next_start(boot_board, still, tmp_path):
+    flash = tmp_path / "flash"
+    flash.mkdir()
+    board = INERTIAL | {"MEASURE_BIAS": False}
+    run = boot_board(world=str(still), seconds=22, board=board, flash=flash)
+    assert run.result["crashes"] == run.result["missed"] == 0
+    assert [line for line in run.lines if line.startswith("bias:")] == [
+        "bias: kept in upright_cal.json"
+    ]
+    assert bias_of(flash) == pytest.approx([1.2, -0.8, 0.6], abs=0.05)
+    again = boot_board(world=str(still), seconds=16, board=board, flash=flash)
+    assert "bias: from upright_cal.json" in again.lines
+    assert again.result["bias_known"]
+    assert not any("kept" in line for line in again.lines)  # it has not changed
+    assert again.times[0] < run.times[0] + 100000
+
+
+def test_the_rest_of_the_calibration_file_stays(boot_board, still, tmp_path):
+    flash = tmp_path / "flash"
+    flash.mkdir()
+    accel = {"offset_ug": [100, 200, 300], "matrix_ppm": [10**6, 0, 0, 0, 10**6, 0, 0, 0, 10**6]}
+    calibration.write(str(flash / "upright_cal.json"), calibration.blank() | {"accel": accel})
+    boot_board(world=str(still), seconds=16, board=INERTIAL | {"MEASURE_BIAS": False}, flash=flash)
+    fields = calibration.read(str(flash / "upright_cal.json"))
+    assert fields["accel"] == accel
+    assert fields["gyro_bias_udps"] is not None
+
+
+@pytest.mark.parametrize("settings", [{"KEEP_BIAS": False}, {"FILTER": "mahony6"}])
+def test_it_is_not_kept_where_nobody_learns_or_wants_it(boot_board, still, tmp_path, settings):
+    flash = tmp_path / "flash"
+    flash.mkdir()
+    boot_board(world=str(still), seconds=16, board=INERTIAL | settings, flash=flash)
+    assert list(flash.iterdir()) == []
+
+
+def test_it_starts_in_motion_without_waiting_and_is_right(boot_board, tmp_path):
+    path = tmp_path / "hand.imu"
+    motion = motions.render("hand", rate=(200, 1), seconds=14)
+    motion.write(path)
+    run = boot_board(world=str(path), seconds=14, board=INERTIAL)
+    assert run.result["started"]
+    assert run.times[0] < 2000000  # one try of a second, not four
+    assert run.score(motion, since_us=6000000).inclination < 1.0
+
+
+def test_the_status_page_tells_of_rest_field_and_bias(boot_board, still):
+    pictures = []
+    for name in ("inertial9", "mahony9"):
+        board = {"FILTER": name, "PAGE_SECONDS": 2}
+        run = boot_board(board_name="robomaster_a", world=str(still), seconds=5, board=board)
+        assert run.result["started"]
+        pictures.append(np.array(run.picture))
+    inertial, mahony = pictures
+    assert inertial[:8, :48].any()  # AT REST
+    assert not mahony[:8, :48].any()  # it does not say
+    assert (inertial[:8, 60:] == mahony[:8, 60:]).all()  # FIELD OK
