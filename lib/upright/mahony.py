@@ -1,15 +1,15 @@
-# Mahony's attitude filter with a fixed step in 32-bit integers, for six and for nine axes: sensor
-# counts in, quaternion out.
-# Needs attitude.py, fixmath.py and the viper emitter. update() is made for a hard interrupt: it allocates
-# nothing, raises nothing, uses no float, and gives the same bits on every port. docs/numerics.md
-# has the bounds.
+# Mahony's attitude filter with a fixed step in 32-bit integers, for six and for nine axes: sensor counts in, quaternion
+# out. Needs attitude.py, fixmath.py, mahony_kernels.py and the viper emitter. update() is made for a hard interrupt: it
+# allocates nothing, raises nothing, uses no float, and gives the same bits on every port. docs/numerics.md has the
+# bounds.
 
 import micropython
 from micropython import const
 
 from upright import fixmath
 from upright.attitude import Attitude, bias_of, hertz
-from upright.fixmath import north, tilt, turn
+from upright.fixmath import turn
+from upright.mahony_kernels import MAG_LOW, STEPS_MAX, north, tilt
 
 # -- words of the state: written by tools/upright_host/words.py
 _PROBE = const(0)  # always -1: ptr32 zero-extends on 64-bit ports, see fixmath.py
@@ -17,7 +17,7 @@ _Q = const(1)  # 4, Q29: quaternion w x y z, body to earth
 _QR = const(5)  # 4, Q44: what rounding has left of it, 0..32767
 _W = const(9)  # 3, Q31: half the angle of this step, rad
 _WR = const(12)  # 3, Q46: what rounding has left of it, 0..32767
-_E = const(22)  # 3, Q29: the attitude error as a rotation vector in the body; see fixmath.north
+_E = const(22)  # 3, Q29: the attitude error as a rotation vector in the body; see north
 _LOW = const(25)  # least squared length / 4 of the accelerometer's counts that is used, 4..2**28
 _I = const(26)  # 3: integral of the feedback, half angle per step, Q(31 + I_SHIFT)
 _IR = const(29)  # 3: its remainder, KI_SHIFT bits
@@ -242,7 +242,7 @@ class Mahony9(Mahony6):
     """Mahony6 with a magnetometer (counts 6..8): yaw is the magnetic heading, x of the earth frame is north.
 
     rate, gyro_scale, accel_lsb_per_g, bias_limit_dps: as for Mahony6. kp and ki act on the sum of
-    both errors, accel x up and mag x the field that the attitude makes of it (fixmath.north). A
+    both errors, accel x up and mag x the field that the attitude makes of it (mahony_kernels.north). A
     heading error falls with the time constant 1 / (kp (1 - sin(dip))) in s: a steep field turns the
     attitude rather about the horizontal, which the accelerometer undoes.
 
@@ -276,7 +276,7 @@ class Mahony9(Mahony6):
         up, field = tuple(counts[0:3]), tuple(counts[6:9])
         usable = counts[10] & 2 and -32768 < min(field) and max(field) < 32767
         length = _dot(field, field)
-        if usable and sum([v * v >> 2 for v in field]) >= fixmath.MAG_LOW:
+        if usable and sum([v * v >> 2 for v in field]) >= MAG_LOW:
             # |up x field|**2
             across = _dot(up, up) * length - _dot(up, field) ** 2
             if across * _SEED_SINE**2 >= _dot(up, up) * length:
@@ -370,9 +370,9 @@ def _set_gains(s, rate, gyro_scale, kp, ki, bias_limit_dps, error_max=1):
     s[_I_MAX] = i_max
     s[_MAG_MOST] = 0
     if error_max > 1:
-        # E is coarser by fixmath.north's shift, and the gains' shifts are so much smaller meanwhile
+        # E is coarser by mahony_kernels.north's shift, and the gains' shifts are so much smaller meanwhile
         finest = min(s[_KP_SHIFT], s[_KI_SHIFT] - 1)
-        steps = min((4 << finest) - 3, fixmath.STEPS_MAX, -(-num // (_MAG_LEAST_HZ * den)))
+        steps = min((4 << finest) - 3, STEPS_MAX, -(-num // (_MAG_LEAST_HZ * den)))
         if s[_KP]:
             unit = 1 << (s[_KP_SHIFT] + 14)  # 2 kp dt = KP / unit
             steps = min(steps, unit // s[_KP], (_W_MAX - least) * unit // (s[_KP] << 29) - 1)

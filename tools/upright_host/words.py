@@ -24,7 +24,7 @@ WR           3  Q46  what rounding has left of it, 0..32767
 V            3  -    a measured vector, scaled so that its length is 2**15..2**16
 VR           1  Q30  1 / that length, 16384..32768
 UP           3  Q28  the estimated up (gravity's reaction) in the body
-E            3  Q29  the attitude error as a rotation vector in the body; see fixmath.north
+E            3  Q29  the attitude error as a rotation vector in the body; see north
 LOW          1  -    least squared length / 4 of the accelerometer's counts that is used, 4..2**28
 I            3  -    integral of the feedback, half angle per step, Q(31 + I_SHIFT)
 IR           3  -    its remainder, KI_SHIFT bits
@@ -318,6 +318,7 @@ MODULES = {
     "attitude": ("mahony", False),
     "fixmath": ("mahony", True),
     "mahony": ("mahony", True),
+    "mahony_kernels": ("mahony", True),
     "euler_kernels": ("euler", True),
     "complementary": ("euler", True),
     "kalman": ("kalman", True),
