@@ -455,6 +455,80 @@ def test_whenever_the_power_fails_on_the_way_from_an_older_one_the_board_boots(b
     assert set(outcomes) == {"old 1\n", "main 1 1 1\n"}
 
 
+@pytest.mark.parametrize(
+    "record",
+    [
+        b"\xff{",
+        b"[" * 5000,
+        b"[1]",
+        b'{"version": 1}',
+        *(json.dumps({"files": files}).encode() for files in (None, 5, "abc", ["a"], {"a": [1]})),
+    ],
+    ids=range(9),
+)
+def test_a_record_that_is_none_is_taken_for_none(board, record):
+    put(board.folder, {flash.RECORD: record, "a": b"mine"})
+    install(board(), files_of(1))
+    assert on_board(board.folder) == files_of(1) | {"a": b"mine"}
+
+
+def test_a_record_reaches_no_file_outside_the_boards_own_folders(board):
+    outside = board.folder.with_name("outside.txt")
+    outside.write_bytes(b"mine")
+    digest = hashlib.sha256(b"mine").hexdigest()
+    names = ["../outside.txt", str(outside), "./../outside.txt", "lib/../../outside.txt", "", "/"]
+    put(board.folder, {flash.RECORD: json.dumps({"files": dict.fromkeys(names, digest)}).encode()})
+    steps = install(board(), files_of(1))
+    assert (steps.remove, steps.kept) == ([], [])
+    assert outside.read_bytes() == b"mine"
+
+
+@pytest.mark.parametrize(
+    "text", ["import\n", "", "x = 1\n", "finish()\n", "finish(x)\n", "finish('a')[0]\n"]
+)
+def test_an_upright_py_that_no_installation_wrote_is_the_users(board, text):
+    put(board.folder, {"upright.py": f"{flash.MARK}, or so\n{text}".encode()})
+    steps = flash.plan(board(), files_of(1))
+    assert [name for name, _ in steps.blocked] == ["upright.py"]
+
+
+def test_an_installation_that_cannot_be_finished_says_why(board):
+    put(board.folder, {"upright.new/0": b"1", "a.txt/mine": b"x"})
+    put(board.folder, {"upright.py": flash._in_front("finish(['a.txt'], [])")})
+    with pytest.raises(device.DeviceError, match=r"cannot be finished: .*in the way"):
+        flash.plan(board(), files_of(1))
+
+
+def test_users_files_under_the_names_of_the_installation_are_kept(board):
+    put(board.folder, {"upright.new/photo.jpg": b"mine", "upright.new/0": b"left over"})
+    install(board(), files_of(1))
+    assert on_board(board.folder) == files_of(1) | {"upright.new/photo.jpg": b"mine"}
+    shutil.rmtree(board.folder / "upright.new")
+    put(board.folder, {"upright.new": b"mine"})
+    assert "rename it" in dict(flash.plan(board(), files_of(2)).blocked)["upright.new"]
+    (board.folder / flash.RECORD).unlink()
+    put(board.folder, {f"{flash.RECORD}/x": b"mine"})
+    assert flash.RECORD in dict(flash.plan(board(), files_of(2)).blocked)
+
+
+def test_an_older_journal_is_followed_and_no_program_of_the_users_is_run(board):
+    journal = {"install": ["app.py", "../x"], "remove": ["old.py", "../outside.txt"]}
+    outside = board.folder.with_name("outside.txt")
+    outside.write_bytes(b"mine")
+    put(board.folder, {"app.py": b"1", "app.py.new": b"2", "old.py": b""})
+    put(board.folder, {"update.py": b"raise SystemExit\n"})
+    put(board.folder, {"update.json": json.dumps(journal).encode()})
+    install(board(), files_of(1))
+    assert on_board(board.folder) == files_of(1) | {
+        "app.py": b"2",
+        "update.py": b"raise SystemExit\n",
+    }
+    assert outside.exists()
+    put(board.folder, {"update.json": b"{}", "calibration.json/x": b"mine"} | recorded(OLD))
+    install(board(), files_of(1))
+    assert (board.folder / "update.json").exists()
+
+
 def test_old_files_that_were_changed_are_kept_and_named(board):
     put(board.folder, OLD | recorded(OLD))
     put(board.folder, {"config.py": b"X = 2\n", "boot.py": OLD["boot.py"] + b"import x\n"})

@@ -40,6 +40,7 @@ except ImportError:
     pass
 """
 FOLDERS = ("lib", "lib/upright", "lib/upright_app")
+JOURNAL = "update.json"  # of older versions
 OLD_CALIBRATION, CALIBRATION = "calibration.json", "upright_cal.json"
 
 # On the board: prints hash (None without a file) and size of each file
@@ -80,12 +81,31 @@ with open({SELF!r}) as _f:
     _text = _f.read()
 exec(_text, {{"__name__": "finish"}})
 """
+_FINISH_OLDER = """
+import os
+for _name in {install!r}:
+    try:
+        os.stat(_name + '.new')
+        try:
+            os.remove(_name)
+        except OSError:
+            pass
+        os.rename(_name + '.new', _name)
+    except OSError:
+        pass
+for _name in {remove!r}:
+    try:
+        os.remove(_name)
+    except OSError:
+        pass
+"""
 # Files of the stage that was left by an installation that never came to hold
 _CLEAR = """
 import os
 try:
     for _f in os.listdir({stage!r}):
-        os.remove({stage!r} + '/' + _f)
+        if _f.isdigit() or _f in ('boot.py', {own!r}):
+            os.remove({stage!r} + '/' + _f)
     os.rmdir({stage!r})
 except OSError:
     pass
@@ -118,12 +138,12 @@ def plan(transport, files: dict[str, bytes], force: bool = False) -> Plan:
     """Compare the board's files with what they are to be. Nothing is changed by it but an older installation that was
     cut off: that is finished first."""
     ours = _finish(transport)
-    recorded = _read_record(transport).get("files", {})
+    recorded = _read_record(transport)
     others = {n: _other_form(n) for n in files if n not in KEPT and n.endswith(("py", "mpy"))}
     root = [f.name for f in transport.fs_listdir("") if not f.st_mode & 0x4000]
     programs = [name for name in root if name.endswith(".py") and name not in SHADOWS]
     names = [*files, *others.values(), *recorded, *SHADOWS, *programs]
-    names += [RECORD, "boot.py", OLD_CALIBRATION, CALIBRATION, *FOLDERS]
+    names += [RECORD, "boot.py", OLD_CALIBRATION, CALIBRATION, *FOLDERS, STAGE]
     found = look(transport, list(dict.fromkeys(names)))
     made = Plan(found=found)
 
@@ -156,9 +176,11 @@ def plan(transport, files: dict[str, bytes], force: bool = False) -> Plan:
             made.kept.append((name, is_ours))
         elif in_the_way(name, is_ours):
             made.install[name] = content
-    for name in FOLDERS:
+    for name in (*FOLDERS, STAGE):
         if found[name][0] not in (None, FOLDER):
             made.blocked.append((name, "a file where a folder is needed; rename it"))
+    if found[RECORD][0] == FOLDER:
+        in_the_way(RECORD, "a folder where a file is needed")
     # a .py is imported before a .mpy of its name, and a file in the root before one in /lib
     for name in [*others.values(), *SHADOWS]:
         is_ours = state(name)
@@ -181,7 +203,11 @@ def plan(transport, files: dict[str, bytes], force: bool = False) -> Plan:
         transport, made, [n for n in programs if isinstance(state(n), str)], programs, force
     )
     is_older = any(PurePosixPath(n).stem in contents.MOVED for n in _flat(recorded))
-    if is_older and found[CALIBRATION][0] is None and found[OLD_CALIBRATION][0] is not None:
+    if (
+        is_older
+        and found[CALIBRATION][0] is None
+        and found[OLD_CALIBRATION][0] not in (None, FOLDER)
+    ):
         made.install[CALIBRATION] = bytes(transport.fs_readfile(OLD_CALIBRATION))
     kept = {name for name, _ in made.kept}
     installed = {n: hashlib.sha256(c).hexdigest() for n, c in files.items() if n not in kept}
@@ -224,19 +250,37 @@ def _flat(names) -> list[str]:
 
 def _finish(transport) -> set[str]:
     """Finish an earlier installation that was cut off -> names of files that are ours whatever their hash."""
-    transport.exec(
-        "import os\ntry:\n    os.stat('update.json')\n    import update\n    update.finish()\n"
-        "except (OSError, ImportError):\n    pass"  # as older versions of Upright do
-    )
+    _finish_older(transport)
     try:
         text = transport.fs_readfile(SELF).decode()
-    except (OSError, UnicodeDecodeError):
-        return set()
+        call = ast.parse(text).body[-1].value
+        names = {*ast.literal_eval(call.args[0]), SELF}
+        what = call.func.id
+    except (OSError, ValueError, SyntaxError, IndexError, AttributeError, TypeError):
+        return set()  # there is none, or it is the user's
     if not text.startswith(MARK):
         return set()
-    transport.exec(FINISH)
-    call = ast.parse(text).body[-1].value
-    return set(ast.literal_eval(call.args[0])) | {SELF} if call.func.id == "refuse" else set()
+    try:
+        transport.exec(FINISH)
+    except TransportExecError as why:
+        last = str(why).strip().splitlines()[-1]
+        raise device.DeviceError(
+            f"an installation was cut off, and cannot be finished: {last}. Is something of your own in the way? "
+            f"If not, remove /{SELF} and /{STAGE} from the board, and install again"
+        ) from None
+    return names if what == "refuse" else set()
+
+
+def _finish_older(transport):
+    """The same for older versions. Their journal: {"install": [names of what lies at NAME.new], "remove": [names]}."""
+    try:
+        journal = json.loads(transport.fs_readfile(JOURNAL))
+        install, remove = (
+            [n for n in journal[key] if _is_plain(n)] for key in ("install", "remove")
+        )
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+        return
+    transport.exec(_FINISH_OLDER.format(install=install, remove=[*remove, JOURNAL]))
 
 
 # ------------------------------------------------------------------------------------------ carrying it out
@@ -251,7 +295,7 @@ class Work:
     """
 
     def __init__(self, transport, plan: Plan):
-        transport.exec(_CLEAR.format(stage=STAGE))
+        transport.exec(_CLEAR.format(stage=STAGE, own=SELF))
         self.files = files = plan.install | {RECORD: json.dumps(plan.record).encode()}
         self.remove = remove = list(plan.remove)
         # main.py first, then whatever boots is new. Where the file system cannot replace it in one step it is missing
@@ -314,7 +358,7 @@ def execute(transport, plan: Plan, on_progress=None) -> bool:
         for name in [*(n for n in order if n != RECORD), *remove]:
             transport.exec(f"import os\ntry:\n    os.remove({name!r})\nexcept OSError:\n    pass")
         _send(transport, {name: files[name] for name in order}, {}, on_progress)
-        transport.exec(f"import os\nos.rmdir({STAGE!r})\nos.remove({SELF!r})")
+        transport.exec(f"import os\nos.remove({SELF!r})\n" + _CLEAR.format(stage=STAGE, own=SELF))
     return staged
 
 
@@ -382,12 +426,19 @@ def _put_in_front(transport, call: str):
     )
 
 
-def _read_record(transport) -> dict:
+def _read_record(transport) -> dict[str, str]:
+    """{name: hash} of what was installed: only what an installation can have written, names within its own folders."""
     try:
-        record = json.loads(transport.fs_readfile(RECORD))
-    except (OSError, ValueError):
+        files = json.loads(transport.fs_readfile(RECORD))["files"].items()
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return {}
-    return record if isinstance(record, dict) else {}
+    return {name: digest for name, digest in files if _is_plain(name) and isinstance(digest, str)}
+
+
+def _is_plain(name) -> bool:
+    """Is it the name of a file below the board's root: "lib/upright/tick.mpy", but not "/sd/x" or "../x"?"""
+    path = PurePosixPath(name) if isinstance(name, str) else PurePosixPath("/")
+    return bool(path.parts) and not {"/", ".."} & {*path.parts} and str(path) == name
 
 
 def look(transport, names: list[str]) -> dict[str, tuple[str | None, int]]:
