@@ -632,7 +632,7 @@ def test_without_any_trim_there_is_no_verdict():
 
 
 def test_nothing_in_the_tick_allocates(micropython_runtime, portable):
-    lines = portable(micropython_runtime, "mpu6050_alloc.py").splitlines()
+    lines = portable(micropython_runtime, "mpu_alloc.py", "mpu6050").splitlines()
     assert len(lines) == 8
     assert sum(": ok 0 fresh" in line for line in lines) == 6
     assert sum(line.endswith("found") for line in lines) == 2

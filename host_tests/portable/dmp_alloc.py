@@ -1,13 +1,9 @@
 # Does the tick of the DMP's driver allocate? Ticks of reading, converting and health, 10,000 of them with faults, with
 # the heap locked and with it open. Needs only lib/; runs on every MicroPython. Exits with 1 if one failed.
 
-import gc
 import sys
 
-# CPython and a compiled main program leave their folder out of the path.
-sys.path.append(__file__.rsplit("/", 1)[0] if "/" in __file__ else ".")
-
-from allocation import borrowed, grown, locked
+import allocation
 from dmp_bus import OUT, make
 
 TICKS = 10_000
@@ -16,20 +12,9 @@ TICKS = 10_000
 class Ticks:
     def __init__(self, version, axes, faults):
         self.bus, self.dmp = make(version, axes)
-        self.bus.look = self.look
         self.size = len(self.bus.packet)
         self.faults = faults
-        self.looks = bytearray(128)
         self.fresh = 0
-
-    def look(self, register):
-        # twice for every register: asking takes long, as it counts the whole heap
-        if self.looks[register] > 1:
-            return
-        self.looks[register] += 1
-        taken = gc.mem_alloc()
-        if taken > self.bus.peak:
-            self.bus.peak = taken
 
     def tick(self, i):
         bus = self.bus
@@ -63,43 +48,19 @@ class Ticks:
         OUT[0] = word
 
 
-def main():
-    bad = 0
-    for version in (0, 1):
-        for axes in (("x", "y", "z"), ("z", "-y", "x")):
-            for faults in (True, False):
-                ticks = Ticks(version, axes, faults)
-                tick = ticks.tick
-                n = TICKS if faults and axes[0] == "x" and not version else TICKS // 10
-                raised = locked(tick, n) if faults else None
-                taken = 0
-                if not faults:  # raising takes memory where there is some
-                    taken = grown(tick, n) + borrowed(ticks.bus, tick, 30, 45)
-                ok = raised is None and taken == 0 and ticks.fresh > n // 4
-                bad += not ok
-                print(
-                    ticks.dmp.version,
-                    axes,
-                    "with faults:" if faults else "without:",
-                    "ok" if ok else "ALLOCATES",
-                    taken,
-                    "fresh",
-                    ticks.fresh,
-                    "misaligned",
-                    ticks.dmp.misaligned,
-                    "overflows",
-                    ticks.dmp.fifo_overflows,
-                    "resets",
-                    ticks.dmp.resets,
-                )
-    ticks = Ticks(0, ("x", "y", "z"), False)
-    found = locked(ticks.keeps_a_bound_method, 1) is not None
-    print("twin with a bound method:", "found" if found else "MISSED")
-    bad += not found
-    found = sys.maxsize > 1 << 32 or locked(ticks.reads_one_in_q30, 1) is not None
-    print("twin with a large int:", "found" if found else "MISSED")
-    bad += not found
-    sys.exit(1 if bad else 0)
-
-
-main()
+verdict = allocation.Verdict()
+for version in (0, 1):
+    for axes in (("x", "y", "z"), ("z", "-y", "x")):
+        for faults in (True, False):
+            ticks = Ticks(version, axes, faults)
+            n = TICKS if faults and axes[0] == "x" and not version else TICKS // 10
+            judged = allocation.judge(ticks, ticks.tick, n)
+            dmp = ticks.dmp
+            said = "fresh", ticks.fresh, "misaligned", dmp.misaligned
+            said += "overflows", dmp.fifo_overflows, "resets", dmp.resets
+            verdict.ticks("%s %s" % (dmp.version, axes), ticks, judged, ticks.fresh > n // 4, *said)
+ticks = Ticks(0, ("x", "y", "z"), False)
+verdict.twin("a bound method", allocation.locked(ticks.keeps_a_bound_method, 1) is not None)
+large = sys.maxsize > 1 << 32 or allocation.locked(ticks.reads_one_in_q30, 1) is not None
+verdict.twin("a large int", large)
+verdict.end()

@@ -3,16 +3,18 @@
 from array import array
 
 import micropython
+from memory_chip import Watched
 from upright.dmp import MpuDmp
 from upright.mpu6050 import MPU6050
 
 IMAGES = (bytes(3062), bytes(1929))
 
 
-class Bus:
+class Bus(Watched):
     """Registers that are memory, DMP memory that is too, and a FIFO of whole packets of our making."""
 
     def __init__(self, packet):
+        Watched.__init__(self)
         self.memory = bytearray(128)
         self.memory[0x75] = 0x68
         self.dmp = bytearray(4096)
@@ -22,9 +24,6 @@ class Bus:
         self.status = 1
         self.fail = 0
         self.seed = 1
-        self.watch = False
-        self.peak = 0
-        self.look = None
         self.fill()
 
     @micropython.native

@@ -2,14 +2,10 @@
 # recovery and transactions, with the heap locked and with it open. Needs only lib/; runs on every
 # MicroPython. Prints a line each, and exits with 1 if one failed.
 
-import gc
-import sys
 from array import array
 
-# CPython and a compiled main program leave their folder out of the path.
-sys.path.append(__file__.rsplit("/", 1)[0] if "/" in __file__ else ".")
-
-from allocation import borrowed, grown, locked
+import allocation
+from memory_chip import Watched
 from upright.auxiliary_bus import AUX_BUSY, AuxiliaryBus
 from upright.ist8310 import IST8310
 from upright.mpu6050 import MPU6050
@@ -17,15 +13,13 @@ from upright.mpu6050 import MPU6050
 TICKS = 2_000
 MAG = 0x0E
 
-if not hasattr(gc, "mem_alloc"):
-    raise SystemExit("CPython has no heap to lock")
 
-
-class Registers:
+class Registers(Watched):
     """An IMU that is nothing but memory, with a magnetometer of the same kind behind its slot 4 and at its own
     address: no call here allocates, if it raises nothing."""
 
     def __init__(self):
+        Watched.__init__(self)
         self.memory = bytearray(128)
         self.memory[0x75] = 0x68
         self.mag = bytearray(128)
@@ -36,9 +30,6 @@ class Registers:
         self.fail = 0  # nobody on the bus
         self.word = 0
         self.drdy = 1
-        self.watch = False
-        self.peak = 0
-        self.looks = bytearray(256)
 
     def readfrom_mem_into(self, address, register, buffer):
         if self.fail or (address == MAG and self.deaf):
@@ -100,15 +91,6 @@ class Registers:
             self.mag[0x00] = 0x10
             value = 0x0C
         self.mag[register] = value
-
-    def look(self, register):
-        # twice for every register: asking takes long, as it counts the whole heap
-        if self.looks[register] > 1:
-            return
-        self.looks[register] += 1
-        taken = gc.mem_alloc()
-        if taken > self.peak:
-            self.peak = taken
 
 
 class Ticks:
@@ -174,38 +156,14 @@ class Ticks:
         health()
 
 
-def main():
-    bad = 0
-    for name in ("behind", "health", "alone", "transactions"):
-        for faults in (True, False):
-            ticks = Ticks(faults)
-            tick = getattr(ticks, name)
-            raised = locked(tick, TICKS) if faults else None
-            taken = 0
-            if not faults:  # raising takes memory where there is some
-                taken = grown(tick, TICKS) + borrowed(ticks.bus, tick, 300, 245)
-            ok = raised is None and taken == 0 and ticks.busy > TICKS // 100
-            bad += not ok
-            print(
-                name,
-                "with faults:" if faults else "without:",
-                "ok" if ok else "ALLOCATES",
-                taken,
-                "busy",
-                ticks.busy,
-                "errors",
-                ticks.mag.errors,
-                ticks.direct.errors,
-                "resets",
-                ticks.imu.resets,
-                ticks.mag.resets,
-                ticks.direct.resets,
-            )
-    ticks = Ticks(False)
-    found = locked(ticks.keeps_a_bound_method, 1) is not None
-    print("twin with a bound method:", "found" if found else "MISSED")
-    bad += not found
-    sys.exit(1 if bad else 0)
-
-
-main()
+verdict = allocation.Verdict()
+for name in ("behind", "health", "alone", "transactions"):
+    for faults in (True, False):
+        ticks = Ticks(faults)
+        judged = allocation.judge(ticks, getattr(ticks, name), TICKS, 300, 245)
+        mag, direct, imu = ticks.mag, ticks.direct, ticks.imu
+        said = "busy", ticks.busy, "errors", mag.errors, direct.errors
+        said += "resets", imu.resets, mag.resets, direct.resets
+        verdict.ticks(name, ticks, judged, ticks.busy > TICKS // 100, *said)
+verdict.twin("a bound method", allocation.locked(Ticks(False).keeps_a_bound_method, 1) is not None)
+verdict.end()
