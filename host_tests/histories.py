@@ -49,6 +49,28 @@ def rows_of(rendered, mag_every=1):
     return rows.tolist()
 
 
+def of_twin(kind, twin, rendered, mag_every=1, bias=(), gains=None, **options):
+    """A float twin over the same rows, begun as portable/filter_history.py begins the filter: attitudes (n, 4)."""
+    rows = rows_of(rendered, mag_every)
+    filter = kind(rendered.rate, rendered.gyro_scale, rendered.accel_lsb_per_g, **(gains or {}))
+    if bias:
+        filter.set_bias(*bias)
+    filter.seed(rows[0])
+    twin = twin.like(filter, **options)
+    q = np.empty((len(rows), 4))
+    for i, row in enumerate(rows):
+        twin.update(row)
+        q[i] = twin.q
+    return q
+
+
+def hold(what, q, twin, limit):
+    """Never further than limit degrees apart; pytest -rP shows the figure."""
+    worst = angles_between(q, twin).max()
+    print(f"{what}: {worst:.6f} deg")
+    assert worst < limit
+
+
 def angles_between(p, q):
     """Degrees between the quaternions of two (n, 4) arrays."""
     p, q = p / np.linalg.norm(p, axis=1)[:, None], q / np.linalg.norm(q, axis=1)[:, None]
