@@ -161,6 +161,30 @@ def test_a_program_that_only_prints_comes_to_its_end(upright, tmp_path):
     assert done.exit_code == 0
 
 
+@pytest.mark.parametrize("before", [None, "a real board's"])
+def test_exec_leaves_the_folders_calibration_file_as_it_was(upright, tmp_path, monkeypatch, before):
+    monkeypatch.chdir(tmp_path)
+    kept = tmp_path / "upright_cal.json"
+    if before:
+        kept.write_text(before)
+    script = tmp_path / "program.py"
+    script.write_text(
+        "with open('upright_cal.json', 'w') as file:\n    file.write('simulated')\n"
+        "open('log.csv', 'w').close()\n"
+    )
+    assert upright("exec", "--runtime", "cpython", script).exit_code == 0
+    assert (kept.read_text() if kept.exists() else None) == before
+    assert (tmp_path / "log.csv").exists()  # what the program itself writes stays
+
+
+def test_a_program_ended_by_ctrl_c_ends_without_the_simulators_traceback(tmp_path):
+    script = tmp_path / "program.py"
+    script.write_text("raise KeyboardInterrupt\n")
+    argv, environment = runtimes.program("cpython", script)
+    done = subprocess.run(argv, env=environment, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (130, "")
+
+
 @pytest.mark.parametrize("board", [name for name in paths.boards() if name != "robomaster_a"])
 def test_every_board_has_its_sensor_and_display_on_its_pins(board, tmp_path):
     script = tmp_path / "program.py"

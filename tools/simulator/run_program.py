@@ -53,6 +53,8 @@ def main():
         exec(code, {"__name__": "__main__", "__file__": path, "print": slow_print})
     except kernel.PowerOff:
         pass
+    except KeyboardInterrupt:
+        sys.exit(130)
     except OSError as why:
         if why.args[0] != _EPIPE:  # whoever read what it printed has gone
             raise

@@ -4,6 +4,7 @@ The file that it writes is lib/upright/calibration.py's, which also reads and ch
 chip's own frame. docs/calibration.md says how to record, and gives the formula.
 """
 
+import contextlib
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +100,19 @@ _BOARD = typer.Option(None, help="The board's NAME (a recorded .imu knows).")
 _RATE = typer.Option(None, min=1, help="Rows per second of a .csv.")
 _ACCEL_RANGE = typer.Option(8, help="Accelerometer range of a .csv, g.")
 _GYRO_RANGE = typer.Option(2000, help="Gyro range of a .csv, deg/s.")
+
+
+@contextlib.contextmanager
+def untouched():
+    """The calibration file of this folder is a real board's: what a simulated one stores in it meanwhile is undone."""
+    before = _DEFAULT.read_bytes() if _DEFAULT.exists() else None
+    try:
+        yield
+    finally:
+        if before is None:
+            _DEFAULT.unlink(missing_ok=True)
+        elif _DEFAULT.read_bytes() != before:
+            _DEFAULT.write_bytes(before)
 
 
 def register(app: typer.Typer) -> None:

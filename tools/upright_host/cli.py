@@ -80,10 +80,15 @@ def exec_file(
     board: str = typer.Option("sim", callback=paths.known_board, help="A folder of boards/."),
     seconds: float = options.seconds("Stop it after so much simulated time (default: never)."),
 ):
-    """Run a MicroPython program on a simulated board: its chips on its buses, level, at rest, with a sensor's noise."""
+    """Run a MicroPython program on a simulated board: its chips on its buses, level, at rest, with a sensor's noise.
+
+    Options of this command stand before FILE. Ctrl-C ends the program.
+    """
     runtime = runtime or simulate.best_runtime()
     argv, environment = runtimes.program(runtime, file, args or (), board, seconds)
-    raise typer.Exit(subprocess.run(argv, env=environment).returncode)
+    with calibrate.untouched():
+        code = subprocess.run(argv, env=environment).returncode
+    raise typer.Exit(code)
 
 
 @app.command("runtimes")
