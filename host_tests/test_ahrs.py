@@ -92,6 +92,18 @@ def test_a_body_at_rest_has_its_angles_and_no_motion_of_its_own(drive):
     assert 195 <= imu.status()["steps"] <= 201
 
 
+def test_nine_axes_without_a_magnetometer_have_no_heading_and_say_so():
+    said = []
+    imu, _ = start(filter="inertial9", log=lambda *words: said.append(" ".join(map(str, words))))
+    assert imu.heading() is None
+    assert "filter: inertial9 without a magnetometer: it has no heading" in said
+
+
+def test_a_bus_in_place_of_a_driver_is_refused():
+    with pytest.raises(TypeError, match=r"as in AHRS\(MPU6050\(i2c\)\)"):
+        upright.AHRS(object())
+
+
 def test_linear_acceleration_turns_with_the_body():
     """A push of 0.1 g along the body's x, after a quarter to the left: along the earth's y."""
     imu, _ = start((410, 0, G))

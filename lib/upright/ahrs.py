@@ -101,6 +101,8 @@ class AHRS:
         log=print,
         **settings,
     ):
+        if not hasattr(sensor, "configure"):
+            raise TypeError("the sensor is a driver, as in AHRS(MPU6050(i2c)), not %r" % (sensor,))
         given = {"RATE": rate, "FILTER": filter, "DRIVE": drive, "CALIBRATION": calibration}
         for name in settings:
             given[name.upper()] = settings[name]
@@ -263,6 +265,8 @@ class AHRS:
             self.bias.known = True  # the sensor corrects it itself
         else:
             self.filter = filters.make(name, rate, sensor, settings.GAINS)
+            if self.filter.AXES == 9 and self.magnetometer is None:
+                self.log("filter: %s without a magnetometer: it has no heading" % name)
             self.bias.find()
             self._seed()
         self._make_step()
@@ -437,7 +441,7 @@ class AHRS:
         return self.reading().linear_acceleration(frame)
 
     def heading(self):
-        """Degrees clockwise from true north, 0..360; None with six axes."""
+        """Degrees clockwise from true north, 0..360; None with six axes or no magnetometer."""
         return self.reading().heading()
 
     def turns(self):

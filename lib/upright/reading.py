@@ -76,9 +76,9 @@ class Reading:
         return a + 2 * (y * k - z * j), b + 2 * (z * i - x * k), c + 2 * (x * j - y * i)
 
     def heading(self):
-        """Direction of body x in degrees clockwise from true north, 0..360; None with six axes."""
+        """Direction of body x in degrees clockwise from true north, 0..360; None with six axes or no magnetometer."""
         ahrs = self._ahrs
-        if ahrs.filter.AXES < 9:
+        if ahrs.filter.AXES < 9 or ahrs.magnetometer is None:
             return None
         mdeg = array("i", [0] * 3)
         fixmath.euler(self._words, mdeg, ahrs.settings.EULER)
