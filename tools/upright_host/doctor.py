@@ -77,14 +77,18 @@ def register(app: typer.Typer):
             None, help="The board's serial port (default: the only one there is)."
         ),
         axes: bool = typer.Option(
-            False, help="The guided two-minute check of the axis maps instead."
+            False, "--axes", help="The guided two-minute check of the axis maps instead."
         ),
-        south: bool = typer.Option(False, help="With --axes: on the southern half of the earth."),
+        south: bool = typer.Option(
+            False, "--south", help="With --axes: on the southern half of the earth."
+        ),
         simulated: str = typer.Option(
             None, help="Examine this simulated board, a folder of boards/."
         ),
         emulated: bool = typer.Option(
-            False, help="Examine the emulated Pico (`upright flash pico --emulated` before)."
+            False,
+            "--emulated",
+            help="Examine the emulated Pico (`upright flash pico --emulated` before).",
         ),
     ):
         """Examine a board: self-test, chips, rates, timer, heap, axis maps; and what to fix."""

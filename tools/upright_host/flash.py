@@ -527,20 +527,26 @@ def register(app: typer.Typer):
     def flash_command(
         board: str = typer.Argument(..., help="The board, a folder of boards/."),
         port: str = typer.Option(None, help="Its serial port (default: the only one there is)."),
-        source: bool = typer.Option(False, help="Install sources, not compiled modules."),
+        source: bool = typer.Option(
+            False, "--source", help="Install sources, not compiled modules."
+        ),
         everything: bool = typer.Option(
             False,
             "--all",
             help="Install every module, not only those that the board's settings need.",
         ),
         force: bool = typer.Option(
-            False, help="Replace files of your own that are in the way; a copy stays as NAME.bak."
+            False,
+            "--force",
+            help="Replace files of your own that are in the way; a copy stays as NAME.bak.",
         ),
         seconds: float = options.seconds(
             "Show what the board says after its restart for so long (default: 5, emulated 2)."
         ),
         emulated: bool = typer.Option(
-            False, help="Install on an emulated Pico, whose flash is kept between the runs."
+            False,
+            "--emulated",
+            help="Install on an emulated Pico, whose flash is kept between the runs.",
         ),
     ):
         """Install the firmware on a board over USB: compiled for it, only what changed, verified, never half."""

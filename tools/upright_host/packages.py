@@ -132,7 +132,7 @@ def register(app: typer.Typer):
             None, help="Write an index for `mpremote mip install --index` into this folder."
         ),
         check: bool = typer.Option(
-            False, help="Only say whether the package files are as they should be."
+            False, "--check", help="Only say whether the package files are as they should be."
         ),
     ):
         """Write the package files (package.json, lib/upright/*.json), or an index to serve."""

@@ -70,7 +70,9 @@ def register(app: typer.Typer):
             None, help="The board's serial port (default: the only one there is)."
         ),
         emulated: bool = typer.Option(
-            False, help="Record on the emulated Pico (`upright flash pico --emulated` before)."
+            False,
+            "--emulated",
+            help="Record on the emulated Pico (`upright flash pico --emulated` before).",
         ),
     ):
         """Record a board's raw counts, for `upright calibrate`; nothing is written to the board."""

@@ -156,6 +156,7 @@ def _build() -> Path:
     place = _place()
     for left in place.glob(".building-*"):  # by a run that was killed
         shutil.rmtree(left, ignore_errors=True)
+    console.say("rp2040 firmware: building it, a few minutes, once", where=console.errors)
     with (
         console.progress("rp2040 firmware", 100) as at,
         # Everything is made in here; the image alone leaves it, at the end.

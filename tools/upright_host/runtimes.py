@@ -88,6 +88,7 @@ def _obtain(names: list[str]) -> dict[str, str]:
         place.mkdir(exist_ok=True)
         for left in place.glob(".unpacking-*"):  # by a run that was killed
             shutil.rmtree(left, ignore_errors=True)
+        console.say(f"runtimes: fetching {', '.join(wanted)}, once", where=console.errors)
         with (
             console.progress("runtimes: package lists") as at,
             # Everything is made in here and renamed at the end: an interruption leaves nothing half done.
