@@ -61,7 +61,7 @@ def test_an_absent_chip_is_named_with_what_was_tried():
 
 def test_a_chip_on_the_other_address_is_pointed_out():
     wired(address=0x69)
-    with pytest.raises(MPU6050Error, match=r"0x69 answers, with 0x68\. AD0"):
+    with pytest.raises(MPU6050Error, match=r"chip at 0x69 answers with 0x68\. AD0"):
         driver().configure()
     driver(0x69).configure()
 

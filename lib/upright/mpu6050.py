@@ -113,7 +113,7 @@ class I2CPort:
         answers = self._ask((other,))
         if answers:
             hint = (
-                f"0x{other:02x} answers, with 0x{answers[other]:02x}. "
+                f"the chip at 0x{other:02x} answers with 0x{answers[other]:02x}. "
                 "AD0 sets the address: low 0x68, high 0x69"
             )
         else:
