@@ -317,7 +317,7 @@ CORNERS = [
     (1439, 500, 64, {"velocity_noise": 2, "mag_noise": 0.2, "rest_accel_g": 0.1}),
     (50, 500, 8192, {"bias_start": 0.5, "bias_walk": 0.025, "rest_noise": 1, "gyro_noise": 1}),
 ]
-UNUSED = ("fixmath._euler",)
+UNUSED = ("fixmath._euler", "fixmath.add_scaled")
 
 
 @pytest.fixture(scope="module")
