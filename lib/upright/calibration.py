@@ -1,6 +1,6 @@
 # Calibration of counts: offset, matrix and axis map for every sample, and the file that keeps them.
-# Needs the viper emitter, json, binascii.crc32 and os. apply() may run in a hard interrupt: it allocates nothing,
-# raises nothing and uses no float. docs/calibration.md has the formula and the file's format.
+# Needs fixmath.py, the viper emitter, json, binascii.crc32 and os. apply() may run in a hard interrupt: it allocates
+# nothing, raises nothing and uses no float. docs/calibration.md has the formula and the file's format.
 #
 # All set-up is in integers, so that a board with single-precision floats gets the same bits.
 
@@ -11,6 +11,8 @@ from binascii import crc32
 
 import micropython
 from micropython import const
+
+from upright.fixmath import ratio
 
 FORMAT = "upright-calibration"
 VERSION = 1
@@ -106,12 +108,12 @@ class Calibration:
                 "imu_axes %r mirror: turn one sign, or exchange two axes" % (tuple(imu_axes),)
             )
         self._mag_axes, _ = _axes(mag_axes, "mag_axes")
-        if not _is_int(accel_lsb_per_g, 64, 32767):
+        if not is_int(accel_lsb_per_g, 64, 32767):
             raise ValueError(
                 "accel_lsb_per_g is %r, expected an int, 64..32767" % (accel_lsb_per_g,)
             )
         num, den = gyro_scale
-        if not _is_int(num, 1, 1 << 20) or not _is_int(den, 1, 1 << 20):
+        if not is_int(num, 1, 1 << 20) or not is_int(den, 1, 1 << 20):
             raise ValueError("gyro_scale is %r, expected (num, den) LSB per deg/s" % (gyro_scale,))
         self.accel_lsb_per_g = accel_lsb_per_g
         self.gyro_scale = (num, den)
@@ -208,7 +210,7 @@ class Calibration:
         num, den = self.gyro_scale
         body = [sign * bias[i] for i, sign in self._imu_axes]
         body = [_dot(row, body, 1000000) for row in self._trim]
-        return tuple([_round(b * 256 * num, 1000000 * den) for b in body])
+        return tuple([ratio(b * 256 * num, 1000000 * den) for b in body])
 
     def save_gyro_bias(self, path, x, y, z, chip=None, board=None):
         """Store a new gyro bias, in 1/256 count in the body frame, in a file. The rest of the file stays.
@@ -221,7 +223,7 @@ class Calibration:
         for i in range(3):
             axis, sign = self._imu_axes[i]
             body = _dot([row[i] for row in self._trim], (x, y, z), 1000)  # 1/256000 count
-            bias[axis] = sign * _round(body * 1000 * den, 256 * num)
+            bias[axis] = sign * ratio(body * 1000 * den, 256 * num)
         _put(path, "gyro_bias_udps", bias, chip, board)
         self.fields["gyro_bias_udps"] = bias
 
@@ -543,7 +545,8 @@ def _is_name(name):
     return True
 
 
-def _is_int(value, low, high):
+def is_int(value, low, high=1 << 30):
+    """Is it an int, not a bool, from low to high?"""
     return isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
 
 
@@ -568,15 +571,15 @@ def _level(up):
     a, b, c = up
     d = 1000000 + c
     return (
-        (1000000 - _round(a * a, d), -_round(a * b, d), -a),
-        (-_round(a * b, d), 1000000 - _round(b * b, d), -b),
+        (1000000 - ratio(a * a, d), -ratio(a * b, d), -a),
+        (-ratio(a * b, d), 1000000 - ratio(b * b, d), -b),
         (a, b, c),
     )
 
 
 def _dot(row, vector, den):
     """row . vector / den, rounded."""
-    return _round(row[0] * vector[0] + row[1] * vector[1] + row[2] * vector[2], den)
+    return ratio(row[0] * vector[0] + row[1] * vector[1] + row[2] * vector[2], den)
 
 
 def _fold(s, at, trim, axes, matrix_ppm, offset, num, den):
@@ -589,14 +592,7 @@ def _fold(s, at, trim, axes, matrix_ppm, offset, num, den):
         c = 0
         for j in range(3):
             column = [sign * matrix_ppm[3 * axis + j] for axis, sign in axes]
-            m = _round(_dot(trim[i], column, 1000000) * 16384, 1000000)
+            m = ratio(_dot(trim[i], column, 1000000) * 16384, 1000000)
             s[at + 4 * i + j] = m
             c -= m * offset[j]
-        s[at + 4 * i + 3] = _round(c * num, den) + 8192
-
-
-def _round(num, den):
-    """num / den, den > 0, to the nearest integer, halves away from 0."""
-    if num < 0:
-        return -((2 * -num + den) // (2 * den))
-    return (2 * num + den) // (2 * den)
+        s[at + 4 * i + 3] = ratio(c * num, den) + 8192

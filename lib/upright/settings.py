@@ -2,6 +2,7 @@
 # Needs calibration.py, filters.py. Every port.
 
 from upright import calibration, filters
+from upright.calibration import is_int
 
 DEFAULTS = {
     # Sampling. RATE: steps of the filter in Hz, or (num, den) for num/den Hz, with every drive.
@@ -86,7 +87,7 @@ class Settings:
                 raise ValueError("there is no setting %s; see upright/settings.py" % name)
         for name in DEFAULTS:
             setattr(self, name, given.get(name, DEFAULTS[name]))
-        if _is_int(self.RATE, 1):
+        if is_int(self.RATE, 1):
             self.RATE = (self.RATE, 1)
 
     def check(self, axes=6, drive=None):
@@ -98,15 +99,15 @@ class Settings:
         wrong = []
         rate = self.RATE
         good_rate = isinstance(rate, (tuple, list)) and len(rate) == 2
-        good_rate = good_rate and _is_int(rate[0], 1) and _is_int(rate[1], 1)
+        good_rate = good_rate and is_int(rate[0], 1) and is_int(rate[1], 1)
         self._demand(wrong, "RATE", good_rate, "Hz as a positive int, or (num, den) for num/den Hz")
         drives = self.DRIVE is None or self.DRIVE in DRIVES
         self._demand(wrong, "DRIVE", drives, ", ".join(['"%s"' % name for name in DRIVES]))
         for name in ("FIFO_HZ", "MAG_RATE_HZ"):
-            self._demand(wrong, name, _is_int(getattr(self, name), 1), "Hz as a positive int")
+            self._demand(wrong, name, is_int(getattr(self, name), 1), "Hz as a positive int")
         sampled = self.SENSOR_RATE_HZ
         if sampled is not None:
-            good = _is_int(sampled, 1) or isinstance(sampled, tuple)
+            good = is_int(sampled, 1) or isinstance(sampled, tuple)
             self._demand(wrong, "SENSOR_RATE_HZ", good, "Hz as a positive int, or None")
         self._demand(wrong, "ACCEL_RANGE_G", self.ACCEL_RANGE_G in _ACCEL_RANGES, "2, 4, 8 or 16")
         self._demand(
@@ -114,7 +115,7 @@ class Settings:
         )
         self._demand(wrong, "EULER", self.EULER in ("zyx", "zxy"), '"zyx" or "zxy"')
         chunk = self.DISPLAY_CHUNK
-        good = _is_int(chunk, 8, 128) and chunk % 8 == 0
+        good = is_int(chunk, 8, 128) and chunk % 8 == 0
         self._demand(wrong, "DISPLAY_CHUNK", good, "a multiple of 8, 8..128")
         self._demand(wrong, "PAGE_SECONDS", _is_number(self.PAGE_SECONDS, 0), "seconds, 0 or more")
         self._demand(wrong, "DECLINATION", _is_number(self.DECLINATION, -180, 180), "degrees")
@@ -136,7 +137,7 @@ class Settings:
                 "with FIFO_HZ %d the FIFO drive keeps up with %d Hz: FIFO_HZ %d, or a lower RATE"
                 % (self.FIFO_HZ, FIFO_BATCH * self.FIFO_HZ, -(-num // (FIFO_BATCH * den)))
             )
-        if drive == "timer" and _is_int(self.SENSOR_RATE_HZ) and not self.EXTERNAL_CLOCK:
+        if drive == "timer" and is_int(self.SENSOR_RATE_HZ, 1) and not self.EXTERNAL_CLOCK:
             if self.SENSOR_RATE_HZ * den < num:
                 wrong.append(
                     "SENSOR_RATE_HZ is %d: the chip has to sample at RATE or faster"
@@ -166,12 +167,6 @@ class _Scales:
     def __init__(self, settings):
         self.gyro_scale = _GYRO_SCALES[settings.GYRO_RANGE_DPS]
         self.accel_lsb_per_g = 32768 // settings.ACCEL_RANGE_G
-
-
-def _is_int(value, low=None, high=None):
-    if not isinstance(value, int) or isinstance(value, bool):
-        return False
-    return (low is None or value >= low) and (high is None or value <= high)
 
 
 def _is_number(value, low, high=None):
