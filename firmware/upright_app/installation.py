@@ -45,9 +45,8 @@ def _put(staged, name):
         os.stat(staged)
     except OSError:
         return False  # it is in place already
-    os.rename(
-        staged, name
-    )  # on FAT MicroPython removes the old file first: for a moment there is none
+    # on FAT MicroPython removes the old file first: for a moment there is none
+    os.rename(staged, name)
     return True
 
 

@@ -128,10 +128,8 @@ class AHRS:
         self._guard = None
         self.bias = Bias(self)
         self.notes = []  # what start() could not do, in a few words each
-        self.yaw_zero = (
-            0,
-            0,
-        )  # what is taken from the yaw, and from the yaw with its full turns, millidegrees
+        # what is taken from the yaw, and from the yaw with its full turns, millidegrees
+        self.yaw_zero = (0, 0)
         self.rate_hz = 0
 
     # ------------------------------------------------------------------------------------ start and stop

@@ -113,9 +113,8 @@ class AuxiliaryBus:
         Not WAIT_FOR_ES: it would hold back the IMU's own data-ready for a dead magnetometer.
         DELAY_ES_SHADOW: all bytes of one sample appear in EXT_SENS_DATA together.
         """
-        running = (
-            self.running
-        )  # it may be in the middle of a transfer: only the slots are switched off
+        # a running master may be in the middle of a transfer: only its slots are switched off
+        running = self.running
         rows = [] if running else [(_I2C_MST_CTRL, _P_NSR | _CLOCK_400_KHZ, 0xFF)]
         if running:
             rows += [(_SLV0_CTRL + 3 * n, 0, 0xFF) for n in range(self._used)]

@@ -45,9 +45,8 @@ _PROBE = const(0)  # always -1: ptr32 zero-extends where a word is 64 bits, see 
 # rounding
 _M = const(1)
 _GYRO = const(37)  # 3 times the word of body x, y, z, and 1 if its sign is turned
-_STRIDE = const(
-    43
-)  # 3 with a trim, which needs the gyro's matrix; else 6: the gyro's words are only reordered
+# 3 with a trim, which needs the gyro's matrix; else 6: the gyro's words are only reordered
+_STRIDE = const(43)
 _WORDS = const(44)
 
 

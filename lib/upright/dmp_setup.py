@@ -132,9 +132,8 @@ class MpuDmpSetup(Attitude, Counters):
         imu.configure(accel_range_g=2, gyro_range_dps=2000, sample_rate_hz=_BASE_HZ)
         self.chip, self.who_am_i = imu.chip, imu.who_am_i
         two = bytearray(2)
-        imu.registers.read_registers(
-            _TEMP_OUT_H, two
-        )  # packets have no temperature: it stays as it was now
+        # packets have no temperature: it stays as it was now
+        imu.registers.read_registers(_TEMP_OUT_H, two)
         self.counts[9] = ((two[0] << 8 | two[1]) ^ 0x8000) - 0x8000
         self._load()
         self.fifo.size = imu.fifo_size

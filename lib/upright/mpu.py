@@ -526,9 +526,8 @@ class Mpu(Counters):
 
     def _settle(self):
         time.sleep_ms(self.settle_ms)
-        self.registers.read_registers(
-            _INT_STATUS, self._burst
-        )  # drops a sample that was ready meanwhile
+        # drops a sample that was ready meanwhile
+        self.registers.read_registers(_INT_STATUS, self._burst)
         self.monitor.heard()
 
     def _need_configured(self):

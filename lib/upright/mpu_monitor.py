@@ -9,9 +9,8 @@ from micropython import const
 
 # What health() returns
 HEALTH_OK = const(0)  # the register has the value of the table
-HEALTH_MISMATCH = const(
-    1
-)  # it has another value: the chip has reset itself; the next call begins the repair
+# it has another value: the chip has reset itself; the next call begins the repair
+HEALTH_MISMATCH = const(1)
 HEALTH_REPAIRING = const(2)  # the repair goes on
 HEALTH_BUS_ERROR = const(3)  # the bus failed; the same step is taken again next time
 
@@ -34,9 +33,8 @@ _SLV_CTRL = (0x27, 0x2A, 0x2D, 0x30, 0x34)  # I2C_SLV0_CTRL to I2C_SLV4_CTRL
 # Steps of a full reset are pairs of register and value; in place of a register:
 _WAIT = const(0)  # the value is a time in ms since the last write
 _RESET_MS = const(100)  # what the register maps ask for after DEVICE_RESET and SIGNAL_PATH_RESET
-_MASTER_MS = const(
-    5
-)  # the master finishes a transaction in it: 24 bytes, five addresses at the slowest clock
+# the master finishes a transaction in it: 24 bytes, five addresses at the slowest clock
+_MASTER_MS = const(5)
 
 # Bits of _doubt
 _DOUBT = const(1)  # a reset would explain the fault: compare PWR_MGMT_1 out of turn

@@ -655,9 +655,8 @@ def after_tilt(s: ptr32) -> int:
     if i > 3:
         i = 3
     if i:
-        s[_WIDE_FOR] = (
-            i - 1
-        )  # the last correction has to come through before the heading means something
+        # the last correction has to come through before the heading means something
+        s[_WIDE_FOR] = i - 1
     i = 0
     # lost: beyond 2.5 sigma for a second
     if decided & _RUNAWAY:

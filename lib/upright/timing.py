@@ -86,9 +86,8 @@ def make_tick(rate, callback, timer=None):
     and for a port that is not in PORTS.
     """
     if hasattr(micropython, "alloc_emergency_exception_buf"):  # built in on most boards
-        micropython.alloc_emergency_exception_buf(
-            100
-        )  # an exception in a hard callback has no heap
+        # an exception in a hard callback has no heap
+        micropython.alloc_emergency_exception_buf(100)
     num, den = rate if isinstance(rate, tuple) else (rate, 1)
     if num <= 0 or den <= 0:
         raise ValueError("tick rate must be positive, got %d/%d Hz" % (num, den))

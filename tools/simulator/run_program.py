@@ -44,9 +44,8 @@ def main():
     if seconds != "-":
         kernel.stop_at(int(float(seconds) * 1000000))
     sys.argv[:] = sys.argv[3:]
-    sys.path.insert(
-        0, path.rsplit("/", 1)[0]
-    )  # what lies beside it, as a board's root would hold it
+    # what lies beside it, as a board's root would hold it
+    sys.path.insert(0, path.rsplit("/", 1)[0])
     with open(path) as file:
         code = compile(file.read(), path, "exec")
     try:

@@ -83,9 +83,8 @@ def packed(files: dict[str, bytes]) -> dict[str, bytes]:
         elif stem == "lib/upright_app/__init__":
             made[f"{stem}.py"] = b'import upright\n\n__path__ = "/upright_z/upright_app"\n'
         else:
-            packer = zlib.compressobj(
-                9, zlib.DEFLATED, 12
-            )  # takes 4 kB of the board while it unpacks
+            # takes 4 kB of the board while it unpacks
+            packer = zlib.compressobj(9, zlib.DEFLATED, 12)
             made[f"{stem.replace('__init__', 'init')}.z"] = (
                 packer.compress(content) + packer.flush()
             )

@@ -171,9 +171,8 @@ def _unpack_source(folder: Path) -> Path:
         inside = list(scratch.iterdir())
         top = inside[0] if len(inside) == 1 and inside[0].is_dir() else scratch
         place = tree / component.group(1) if component else tree / "debian" if debian else tree
-        shutil.rmtree(
-            place, ignore_errors=True
-        )  # an empty place of a component, upstream's debian/
+        # an empty place of a component, upstream's debian/
+        shutil.rmtree(place, ignore_errors=True)
         top.rename(place)
         with contextlib.suppress(FileNotFoundError):
             shutil.rmtree(scratch)

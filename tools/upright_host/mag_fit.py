@@ -9,9 +9,8 @@ from upright_host.console import Wrong
 LEAST_MAG = 200  # samples
 LEAST_COVERAGE = 0.7  # of the sphere
 _SECTORS = 60  # of equal area, about 30 deg across
-LEAST_SPREAD = (
-    1 / 9
-)  # smallest to largest variance of the cloud: 1/3 of the length; 1/4 is a half sphere
+# smallest to largest variance of the cloud: 1/3 of the length; 1/4 is a half sphere
+LEAST_SPREAD = 1 / 9
 MOST_AXES = 2.5  # longest to shortest axis of the ellipsoid; soft iron of a board: 1.2
 MOST_RESIDUAL = 0.10  # of the field
 DOUBTFUL_RESIDUAL = 0.04
