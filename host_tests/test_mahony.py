@@ -168,46 +168,7 @@ def test_set_quaternion_normalises():
         filter.set_quaternion(0, 0, 0, 0)
 
 
-def test_a_bias_is_subtracted_to_a_256th_of_a_count():
-    """100 s at rest with the bias of 3.3 counts: without it the yaw would drift by 20 deg."""
-    filter = Mahony6(200, SCALE, 4096, kp=0)
-    bias = round(3.3 * 256)
-    filter.set_bias(0, 0, bias)
-    rng = random.Random(1)
-    total = 0
-    for _ in range(20000):
-        gz = 3 + (rng.random() < 0.3)
-        total += gz
-        filter.update(counts(gz=gz))
-    out = array("i", [0] * 3)
-    filter.angles(out)
-    expected = (total - 20000 * bias / 256) / 16.4 / 200
-    assert out[2] == pytest.approx(1000 * expected, abs=1)
-
-
 # -- feedback
-def test_it_levels_from_a_wrong_start_with_the_time_constant_of_kp():
-    filter = Mahony6(200, SCALE, 4096, kp=2)
-    filter.set_quaternion(math.cos(0.1), math.sin(0.1), 0, 0)
-    tilt = []
-    out = array("i", [0] * 3)
-    for _ in range(3):
-        filter.angles(out)
-        tilt.append(out[0])
-        run(filter, counts(), 100)  # half a second: one time constant
-    assert tilt[1] / tilt[0] == pytest.approx(math.exp(-1), rel=0.02)
-    assert tilt[2] / tilt[1] == pytest.approx(math.exp(-1), rel=0.02)
-
-
-def test_it_levels_from_upside_down():
-    filter = Mahony6(200, SCALE, 4096, kp=2)
-    filter.set_quaternion(0.001, 1, 0, 0)
-    run(filter, counts(), 200 * 15)
-    out = array("i", [0] * 3)
-    filter.angles(out)
-    assert abs(out[0]) <= 2 and abs(out[1]) <= 2
-
-
 def test_the_integral_finds_the_bias_across_gravity_and_no_other():
     filter = Mahony6(200, SCALE, 4096, kp=1, ki=0.3)
     run(filter, counts(gx=33, gy=-49, gz=16), 200 * 60)
@@ -257,31 +218,6 @@ def turned(filter, row):
     return mahony_float.angle_between(before, filter.quaternion_floats())
 
 
-@pytest.mark.parametrize(
-    "row",
-    [
-        counts(flags=0),
-        counts(flags=2),
-        counts(flags=5),
-        counts(0, 0, 0),
-        counts(0, 0, 254),
-        counts(100, -100, 100),
-    ],
-    ids=["stale", "only a fresh magnetometer", "full scale", "zero", "62 mg", "42 mg"],
-)
-def test_no_feedback_from_an_accelerometer_that_cannot_be_used(row):
-    filter = tilted_filter(kp=1, ki=0.5)
-    assert turned(filter, row) < 1e-7
-    out = array("i", [9] * 3)
-    filter.integral_mdps(out)
-    assert list(out) == [0, 0, 0]
-
-
-@pytest.mark.parametrize("row", [counts(flags=1), counts(flags=9), counts(0, 0, 256)])
-def test_feedback_from_one_that_can(row):
-    assert turned(tilted_filter(kp=1), row) > 0.01
-
-
 @settings(max_examples=30)
 @given(st.integers(-400, 400), st.integers(-400, 400), st.integers(-400, 400))
 @example(0, 0, 256)
@@ -325,21 +261,6 @@ def test_the_length_stays_one_over_100000_steps():
     assert worst < 2e-8
 
 
-@pytest.mark.parametrize("rate", [50, 200, (2000, 7), 8000])
-@pytest.mark.parametrize("scale", [(131, 1), (131, 2), (164, 5), (82, 5)])
-def test_the_gyro_gain_is_exact(rate, scale):
-    """One full turn about z at three quarters of full scale ends where it began."""
-    filter = Mahony6(rate, scale, 4096, kp=0)
-    num, den = rate if isinstance(rate, tuple) else (rate, 1)
-    gz = 24000
-    steps = round(360 * scale[0] / scale[1] / gz * num / den)
-    run(filter, counts(gz=gz), steps)
-    yaw = array("i", [0] * 3)
-    filter.angles(yaw)
-    expected = gz * scale[1] / scale[0] * steps * den / num
-    assert (yaw[2] / 1000 - expected + 180) % 360 - 180 == pytest.approx(0, abs=0.002)
-
-
 @pytest.mark.parametrize("rate", [50, 100, 200, 500, 1000, 2000, 4000, 8000, (2000, 7)])
 @pytest.mark.parametrize("scale", [(131, 1), (131, 2), (164, 5), (82, 5)])
 @pytest.mark.parametrize("kp, ki", [(10, 1), (0.5, 0), (0.5, 0.02), (0.001, 1e-6), (0, 0)])
@@ -364,13 +285,7 @@ def test_the_usual_rates_ranges_and_gains_are_accepted_and_held(rate, scale, kp,
         ({"rate": 20}, r"rate is 20 Hz, expected 39\.\.\d+ Hz at 82/5 LSB"),
         ({"rate": (39, 2)}, r"rate is 39/2 Hz, expected 39\.\."),
         ({"rate": 1000000}, r"rate is 1000000 Hz, expected 39\.\.285\d\d\d Hz"),
-        ({"rate": 0}, "rate is 0, expected a positive int or a pair"),
-        ({"rate": 200.5}, "rate is 200.5, expected a positive int or a pair"),
-        ({"rate": (200, 0)}, r"rate is \(200, 0\), expected"),
-        ({"gyro_scale": (82, -5)}, r"gyro_scale is \(82, -5\), expected"),
-        ({"gyro_scale": 16.4}, "gyro_scale is 16.4, expected"),
         ({"gyro_scale": (1, 1)}, r"rate is 200 Hz, expected 6\d\d\.\.\d+ Hz at 1/1 LSB"),
-        ({"accel_lsb_per_g": 40000}, r"accel_lsb_per_g is 40000, expected an int, 64\.\.32767"),
         ({"kp": 150}, r"kp is 150, expected 0 or 0\.000006\.\.99\.992000 rad/s at a rate of 200"),
         ({"rate": 40, "kp": 15}, r"kp is 15, expected 0 or 0\.\d+\.\.3\.\d+ rad/s"),
         ({"kp": 1e-6}, r"kp is 1e-06, expected 0 or 0\.000006"),
