@@ -192,3 +192,23 @@ def loaded(paths, watch):
                 sys.modules[name] = module
                 setattr(upright, name.partition(".")[2], module)
     return modules
+
+
+def word(rng):
+    """Any word of a sample, and the largest foremost."""
+    return rng.choice((-32768, 32767, 32766, rng.randint(-32768, 32767), rng.randint(-900, 900)))
+
+
+def stand_still(rng, filter, row, at):
+    """Let the rest detector of a filter with the words `at` be content with a sample, at any bias that was set."""
+    s = filter.state
+    filter.set_bias(*(rng.choice((-(1 << 21), 1 << 21, 0)) for _ in range(3)))
+    most = s[at.REST_MOST] // 4096
+    for i in range(3):
+        low = rng.choice((-most, most))
+        row[3 + i] = low + s[at.BASE + i] // 256
+        s[at.LOW1 + 3 + i] = s[at.LOW2 + 3 + i] = low << 12
+        s[at.GS + i] = row[3 + i] * ((1 << s[at.BLOCK]) - 1)
+        s[at.LOW1 + i] = s[at.LOW2 + i] = row[i] << 12
+    s[at.BLOCKS] = 1000
+    s[at.STILL] = rng.choice((s[at.REST_AFTER], 0))

@@ -9,7 +9,7 @@ import motions
 import numpy as np
 import overflow
 import pytest
-from histories import ONE, SCALE, angles_between, bias_at_rest, rows_of
+from histories import ONE, SCALE, angles_between, bias_at_rest, hold, of_twin
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from reference.complementary_float import EulerFloat
@@ -49,33 +49,13 @@ def history(filter_history):
     return go
 
 
-def filter_for(rendered, first, bias=(), **gains):
-    """As portable/filter_history.py begins."""
-    filter = Euler6(rendered.rate, rendered.gyro_scale, rendered.accel_lsb_per_g, **gains)
-    if bias:
-        filter.set_bias(*bias)
-    filter.seed(first)
-    return filter
-
-
 def float_history(rendered, bias=(), gains=None, **options):
     """The float twin over all rows: (n, 4)."""
-    rows = rows_of(rendered)
-    twin = EulerFloat.like(filter_for(rendered, rows[0], bias, **(gains or {})), **options)
-    q = np.empty((len(rows), 4))
-    for i, row in enumerate(rows):
-        twin.update(row)
-        q[i] = twin.q
-    return q
+    return of_twin(Euler6, EulerFloat, rendered, bias=bias, gains=gains, **options)
 
 
 # -- accuracy; pytest -rP shows the figures
-def compare(what, q, twin, limit=LIMIT_DEG):
-    worst = angles_between(q, twin).max()
-    print(f"{what}: {worst:.6f} deg")
-    assert worst < limit
-
-
+# -- accuracy; pytest -rP shows the figures
 @pytest.mark.parametrize("name", motions.MOTIONS)
 @pytest.mark.parametrize("rate, seconds", [(100, 30), (200, 10), (1000, 2)])
 def test_within_a_hundredth_of_a_degree_of_the_float_twin(history, name, rate, seconds):
@@ -84,7 +64,7 @@ def test_within_a_hundredth_of_a_degree_of_the_float_twin(history, name, rate, s
         q = history(quickest(), rendered, tau=tau)
         twin = float_history(rendered, gains={"tau": tau})
         limit = NEAR_THE_POLE_DEG.get((name, rate), LIMIT_DEG)
-        compare(f"{name} {rate} Hz {seconds} s tau {tau}", q, twin, limit)
+        hold(f"{name} {rate} Hz {seconds} s tau {tau}", q, twin, limit)
 
 
 def test_within_a_hundredth_of_a_degree_of_the_float_twin_on_a_recorded_trial(history, recorded):
@@ -94,7 +74,7 @@ def test_within_a_hundredth_of_a_degree_of_the_float_twin_on_a_recorded_trial(hi
     if runtime == "cpython":
         trial.counts = trial.counts[:5000]
     bias = bias_at_rest(trial)
-    compare(f"{trial.name}", history(runtime, trial, bias), float_history(trial, bias))
+    hold(trial.name, history(runtime, trial, bias), float_history(trial, bias), LIMIT_DEG)
 
 
 def test_the_comparison_sees_a_first_order_step(history):

@@ -2,12 +2,14 @@
 
 import math
 import random
+import re
 from array import array
 
 import motions
 import numpy as np
 import pytest
 from histories import ONE, SCALE, SCALES
+from samples import counts, run
 from scenes import PACES, all_axes, as_start, errors, pushes, scene
 from upright import earth_kernels
 from upright.inertial import Inertial9
@@ -183,6 +185,50 @@ def test_no_constant_shrinks_with_the_rate(history, kind):
         assert np.abs(found[1000][0]).max() > 0.3  # it was not there yet
 
 
+# -- interface
+def test_it_coasts_on_the_last_gyro_words_without_feedback(kind):
+    filter = KINDS[kind](200, SCALE, 4096)
+    run(filter, counts(flags=3), 200 * 4)
+    before = list(filter.state)
+    run(filter, counts(4096, 0, 0, gz=820, mx=-66, flags=2), 200)  # they disagree
+    out = array("i", [0] * 3)
+    filter.angles(out)
+    assert list(out) == pytest.approx([0, 0, 50000], abs=30)
+    # nothing but the attitude and its remainders has changed, and the time since the last sample
+    at = words.places(kind.replace("-", "_"))
+    held = slice(at.G, at.GAP if kind == "inertial" else None)
+    assert list(filter.state)[held] == before[held]
+
+
+def test_what_it_says_of_itself(kind):
+    filter = KINDS[kind](200, SCALE, 4096)
+    inertial = kind == "inertial"
+    assert (filter.resting, filter.mag_accepted) == (False, False)
+    if inertial:
+        assert filter.heading_uncertainty_mdeg == pytest.approx(180000, abs=100)
+        assert filter.tilt_confidence == 1000
+    row = counts(flags=3)
+    filter.seed(row)
+    run(filter, row, 200)
+    assert not filter.resting
+    run(filter, row, 400)
+    assert filter.resting and filter.mag_accepted
+    if inertial:
+        assert filter.heading_uncertainty_mdeg < 3000
+        assert filter.tilt_confidence > 990
+        run(filter, row, 200 * 5)  # now the field is known
+    run(filter, counts(mx=0, my=400, flags=3), 200)
+    assert not filter.mag_accepted
+    near = filter.heading_uncertainty_mdeg
+    rng = random.Random(1)
+    for _ in range(600):
+        filter.update(counts(*(rng.randint(-9000, 9000) for _ in range(3)), gx=400, flags=1))
+    assert not filter.resting and not filter.mag_accepted
+    if inertial:
+        assert filter.tilt_confidence < 400
+        assert filter.heading_uncertainty_mdeg > near
+
+
 # -- what is refused
 @pytest.mark.parametrize("rate", [90, 100, (200, 1), (2000, 7), 500, 1000, (1000, 11)])
 @pytest.mark.parametrize("fsr", [250, 500, 1000, 2000])
@@ -201,6 +247,35 @@ def test_a_gyro_too_fine_for_the_rest_detector_is_refused(kind):
         KINDS[kind](200, (1000, 1), 2048, rest_gyro_dps=10)
 
 
-def test_what_it_does_not_know_is_named_with_what_there_is(kind):
-    with pytest.raises(TypeError, match=r"no parameter 'tau'; there are .*rest_after"):
-        KINDS[kind](200, SCALE, 2048, tau=3)
+def test_a_step_that_could_turn_by_too_much_is_refused(kind):
+    slow, least, most = {"inertial": (60, 75, 85), "quaternion-kalman": (50, 50, 60)}[kind]
+    said = rf"rate is {slow} Hz, expected (\d+)..1439 Hz at 82/5"
+    with pytest.raises(ValueError, match=said) as caught:
+        KINDS[kind](slow, SCALE, 2048)
+    low = int(re.search(said, str(caught.value)).group(1))
+    assert KINDS[kind](low, SCALE, 2048) and least < low <= most
+    with pytest.raises(ValueError):
+        KINDS[kind](low - 1, SCALE, 2048)
+
+
+@pytest.mark.parametrize(
+    "name, parameters, said",
+    [
+        ("inertial", {"tau_tilt": 0.1}, "tau_tilt is 0.1, expected 0.5..30"),
+        ("inertial", {"field_tolerance": 0.9}, "field_tolerance is 0.9"),
+        ("inertial", {"bias_limit_dps": "6"}, "bias_limit_dps is '6', expected a number"),
+        ("inertial", {"tau": 3}, "no parameter 'tau'; there are .*rest_after"),
+        ("quaternion-kalman", {"gyro_noise": 0}, r"gyro_noise is 0, expected 0.001\.\.1"),
+        ("quaternion-kalman", {"mag_noise": 0.3}, r"mag_noise is 0.3, expected 0.01\.\.0.2"),
+        ("quaternion-kalman", {"bias_start": "6"}, "bias_start is '6', expected a number"),
+        (
+            "quaternion-kalman",
+            {"bias_walk": 0.1, "bias_start": 1},
+            "bias_walk is 0.1, expected no more than 1/20",
+        ),
+        ("quaternion-kalman", {"tau": 3}, "no parameter 'tau'; there are .*rest_after"),
+    ],
+)
+def test_a_parameter_that_cannot_be_is_refused(name, parameters, said):
+    with pytest.raises((ValueError, TypeError), match=said):
+        KINDS[name](200, SCALE, 2048, **parameters)

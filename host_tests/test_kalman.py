@@ -10,11 +10,10 @@ import motions
 import numpy as np
 import overflow
 import pytest
-from histories import ONE, SCALE, bias_at_rest, rows_of
+from histories import ONE, SCALE, bias_at_rest, hold, of_twin
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from reference.kalman_float import KalmanFloat, PerAngleFloat, ScalarFloat
-from reference.mahony_float import angle_between
 from samples import counts, run
 from upright import complementary, kalman
 from upright.complementary import Euler6
@@ -341,26 +340,9 @@ def history(filter_history):
     return go
 
 
-def filter_and_rows(rendered, bias=(), **gains):
-    """As portable/filter_history.py begins; the rows as lists, with the flags that it gives."""
-    filter = Kalman6(rendered.rate, rendered.gyro_scale, rendered.accel_lsb_per_g, **gains)
-    rows = rows_of(rendered)
-    if bias:
-        filter.set_bias(*bias)
-    filter.seed(rows[0])
-    return filter, rows
-
-
 def compare(what, q, rendered, limit=LIMIT_DEG, bias=(), **gains):
-    """The twin over the same rows; pytest -rP shows the figure."""
-    filter, rows = filter_and_rows(rendered, bias, **gains)
-    twin = KalmanFloat.like(filter)
-    worst = 0
-    for row, ours in zip(rows, q.tolist(), strict=True):
-        twin.update(row)
-        worst = max(worst, angle_between(ours, twin.q))
-    print(f"{what}: {worst:.6f} deg")
-    assert worst < limit
+    """With the twin over the same rows."""
+    hold(what, q, of_twin(Kalman6, KalmanFloat, rendered, bias=bias, gains=gains), limit)
 
 
 @pytest.mark.parametrize("name", motions.MOTIONS)

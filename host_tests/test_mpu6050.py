@@ -3,7 +3,7 @@
 import kernel
 import machine
 import pytest
-from chips.mpu6050 import MPU6050Chip
+from imus import ACCEL_FULL, COUNTS, FRESH, GYRO_FULL, RIGS, tick
 from upright.mpu6050 import (
     HEALTH_BUS_ERROR,
     HEALTH_MISMATCH,
@@ -12,45 +12,15 @@ from upright.mpu6050 import (
     MPU6050,
     MPU6050Error,
 )
-from world import StillWorld
 
-COUNTS = (10, -20, 4096, 5, 6, -7, 0, 0, 0, -521)
-FRESH, ACCEL_FULL, GYRO_FULL = 1, 4, 8
 GYRO_CONFIG, ACCEL_CONFIG, INT_ENABLE = 0x1B, 0x1C, 0x38
 USER_CTRL, PWR_MGMT_1, WHO_AM_I = 0x6A, 0x6B, 0x75
 
 
-def wired(counts=COUNTS, **options):
-    chip = MPU6050Chip(StillWorld(counts), **options)
-    machine.wire_i2c(0, chip)
-    return chip
-
-
-def driver(address=0x68, **options):
-    return MPU6050(machine.I2C(0, freq=400_000), address, **options)
-
-
-def running(counts=COUNTS, rate=1000, configure=None, **options):
-    """(chip, driver) with a fresh sample at every millisecond."""
-    chip = wired(counts, **options)
-    imu = driver()
-    imu.configure(sample_rate_hz=rate, **(configure or {}))
-    return chip, imu
-
-
-def tick(imu, us=1000):
-    kernel.advance(us)
-    return imu.read()
+wired, driver, running = (getattr(RIGS["MPU6050"], name) for name in ("wired", "driver", "running"))
 
 
 # Set-up
-
-
-def test_constructing_touches_no_bus():
-    bus = machine.wire_i2c(0, MPU6050Chip(StillWorld()))
-    before = bus.bytes
-    driver()
-    assert bus.bytes == before and kernel.now() == 0
 
 
 def test_an_absent_chip_is_named_with_what_was_tried():
@@ -63,15 +33,14 @@ def test_a_chip_on_the_other_address_is_pointed_out():
     wired(address=0x69)
     with pytest.raises(MPU6050Error, match=r"chip at 0x69 answers with 0x68\. AD0"):
         driver().configure()
-    driver(0x69).configure()
+    driver(address=0x69).configure()
 
 
-@pytest.mark.parametrize("address", [0x68, None])
-def test_a_chip_that_is_late_after_power_up_is_waited_for(address):
+def test_without_an_address_a_chip_that_is_late_after_power_up_is_waited_for():
     chip = wired()
     chip.power_up_us = 90_000
     chip.brown_out(0)
-    driver(address).configure()
+    driver(address=None).configure()
 
 
 class Clock:
@@ -113,65 +82,24 @@ def test_without_an_address_two_chips_are_refused_and_both_named():
     with pytest.raises(
         MPU6050Error, match=r"0x68 answers .* 0x68 and 0x69 with 0x70.*address=0x69"
     ):
-        driver(None).configure()
-    driver(0x69).configure()
+        driver(address=None).configure()
+    driver(address=0x69).configure()
 
 
 def test_without_an_address_nobody_and_a_stranger_are_told():
     with pytest.raises(MPU6050Error, match=r"no MPU6050 at 0x68 or 0x69.*pull-ups"):
-        driver(None).configure()
+        driver(address=None).configure()
     machine.wire_i2c(0, Clock(0x69))
     with pytest.raises(
         MPU6050Error, match=r"0x69 answers WHO_AM_I .* 0x17.*DS3231.*accept_unknown"
     ):
-        driver(None).configure()
+        driver(address=None).configure()
     assert kernel.now() < 1_000_000
 
 
 def test_an_unknown_identity_is_refused_and_shown():
     wired(who_am_i=0x42)
     with pytest.raises(MPU6050Error, match=r"0x42.*0x68.*DS3231.*accept_unknown"):
-        driver().configure()
-
-
-def test_an_unknown_identity_can_be_insisted_on():
-    wired(who_am_i=0x42)
-    imu = driver(accept_unknown=True)
-    imu.configure()
-    assert imu.chip == "unknown (0x42)" and imu.who_am_i == 0x42
-    assert imu.fifo_size == 512  # the smallest of the family
-    assert tick(imu) & FRESH
-
-
-@pytest.mark.parametrize(
-    "who, name, fifo",
-    [
-        (0x68, "MPU6050", 1024),
-        (0x70, "MPU6500", 512),
-        (0x71, "MPU9250", 512),
-        (0x98, "ICM-20689", 512),
-    ],
-)
-def test_the_identity_decides_name_fifo_and_temperature(who, name, fifo):
-    _, imu = running(who_am_i=who)
-    assert (imu.chip, imu.who_am_i, imu.fifo_size) == (name, who, fifo)
-    assert tick(imu) & FRESH
-    assert abs(imu.temperature_cdeg() - 3500) <= 1  # -521 / 340 + 36.53
-    assert imu.gyro_scale == (82, 5)
-
-
-def test_a_chip_stuck_in_reset_is_reported():
-    chip = wired()
-    chip.reset_us = 10**9
-    with pytest.raises(MPU6050Error, match="did not come out of reset"):
-        driver().configure()
-
-
-@pytest.mark.parametrize("register, name", [(GYRO_CONFIG, "GYRO_CONFIG"), (0x19, "SMPLRT_DIV")])
-def test_a_register_that_does_not_keep_its_value_is_reported(register, name):
-    chip = wired()
-    chip.stick(register, 0x7E)
-    with pytest.raises(MPU6050Error, match=rf"{name} \(0x{register:02x}\): wrote 0x.*read 0x7e"):
         driver().configure()
 
 
@@ -182,18 +110,6 @@ def test_a_bus_fault_at_set_up_names_the_register():
     chip.nack_next(1, after=3 * 6)
     with pytest.raises(MPU6050Error, match="while writing GYRO_CONFIG"):
         imu.configure()
-
-
-def test_set_up_never_does_what_the_register_map_forbids():
-    chip, imu = running()
-    imu.fifo_enable()
-    imu.configure_interrupt(latch=True)
-    imu.self_test()
-    imu.sleep()
-    imu.wake()
-    imu.fifo_disable()
-    assert chip.misuse == []
-    assert chip.register(PWR_MGMT_1) & 0x07 == 1  # clocked by the gyro
 
 
 # Configuration
@@ -311,21 +227,6 @@ def test_nothing_works_before_configure():
 # Samples
 
 
-def test_a_sample_lands_in_counts_in_the_common_order():
-    _, imu = running()
-    assert tick(imu) == FRESH
-    assert list(imu.counts) == [*COUNTS, FRESH]
-
-
-def test_a_sample_is_fresh_once():
-    _, imu = running(rate=200)
-    start = kernel.now()
-    fresh = [tick(imu) & FRESH for _ in range(50)]
-    assert abs(sum(fresh) - (kernel.now() - start) / 5000) <= 1
-    assert imu.stale == 50 - sum(fresh)
-    assert list(imu.counts)[:10] == list(COUNTS)
-
-
 def test_a_sleeping_chip_gives_no_fresh_sample():
     chip, imu = running()
     imu.sleep()
@@ -356,13 +257,6 @@ def test_an_axis_at_full_scale_is_flagged(axis, value, flag):
     _, imu = running(counts)
     assert tick(imu) == FRESH | flag
     assert imu.counts[10] == FRESH | flag
-
-
-@pytest.mark.parametrize("raw", [-32768, -521, -1, 0, 1, 340, 32767])
-def test_temperature_is_exact_to_a_hundredth(raw):
-    _, imu = running((0, 0, 0, 0, 0, 0, 0, 0, 0, raw))
-    tick(imu)
-    assert abs(imu.temperature_cdeg() - (raw / 340 + 36.53) * 100) <= 0.5001
 
 
 def test_a_program_gets_g_and_degrees_per_second_and_celsius():
@@ -407,17 +301,6 @@ def test_with_a_bus_that_fails_the_programs_own_exception_is_the_one_that_comes_
 # Faults in the tick
 
 
-def test_a_chip_that_stops_answering_is_counted_and_its_words_are_kept():
-    chip, imu = running()
-    tick(imu)
-    chip.vanish()
-    flags = [tick(imu) for _ in range(10)]
-    assert flags == [0] * 10 and imu.errors == 10
-    assert list(imu.counts) == [*COUNTS, 0]
-    chip.come_back()
-    assert tick(imu) == FRESH
-
-
 @pytest.mark.parametrize("after", [0, 1, 2])
 def test_a_nack_anywhere_in_a_burst_costs_one_sample(after):
     chip, imu = running()
@@ -425,33 +308,6 @@ def test_a_nack_anywhere_in_a_burst_costs_one_sample(after):
     assert not tick(imu) & FRESH
     assert imu.errors == 1
     assert tick(imu) & FRESH
-
-
-class Broken:
-    def __init__(self, error):
-        self.error = error
-
-    def readfrom_mem_into(self, address, register, buffer):
-        raise self.error
-
-    def writeto(self, address, buffer):
-        raise self.error
-
-
-@pytest.mark.parametrize("error", [OSError(5), OSError(19), OSError(110), OSError("custom")])
-def test_any_bus_error_is_survived_whatever_the_port_calls_it(error):
-    _, imu = running()
-    imu.registers.bind(Broken(error))
-    imu.monitor.errors = (1 << 30) - 2
-    assert [imu.read(), imu.health(), imu.read()] == [0, HEALTH_BUS_ERROR, 0]
-    assert imu.errors == 1  # the counter wraps within a small int
-
-
-def test_other_errors_are_not_hidden():
-    _, imu = running()
-    imu.registers.bind(Broken(TypeError()))
-    with pytest.raises(TypeError):
-        imu.read()
 
 
 # Health and repair
@@ -587,27 +443,6 @@ def test_slow_samples_do_not_keep_health_from_the_other_registers():
 
 
 # Self-test
-
-
-def test_self_test_passes_on_a_sound_chip_and_restores_the_configuration():
-    chip, imu = running(configure={"gyro_range_dps": 500, "accel_range_g": 4}, rate=200)
-    passed, changes = imu.self_test()
-    assert passed is True
-    assert all(abs(change) <= 2 for change in changes)
-    assert [(register, chip.register(register)) for register, _ in imu.configuration()] == (
-        imu.configuration()
-    )
-    assert tick(imu, 5000) & FRESH
-
-
-@pytest.mark.parametrize("axis", range(6))
-def test_self_test_fails_for_the_axis_that_does_not_react(axis):
-    chip, imu = running()
-    chip.broken = (axis,)
-    passed, changes = imu.self_test()
-    assert passed is False
-    assert changes[axis] == -1000
-    assert all(abs(changes[i]) <= 2 for i in range(6) if i != axis)
 
 
 @pytest.mark.parametrize("codes", [(1,) * 6, (31,) * 6, (2, 9, 20, 5, 12, 30)])

@@ -2,7 +2,6 @@
 
 import math
 import random
-import re
 from array import array
 
 import motions
@@ -328,10 +327,6 @@ def checked():
     return watch, modules["quaternion_kalman"]
 
 
-def word(rng):
-    return rng.choice((-32768, 32767, 32766, rng.randint(-32768, 32767), rng.randint(-900, 900)))
-
-
 def covariance(rng, most):
     """A covariance with sigmas up to `most`, from none to full correlation, as the 36 integers of a state."""
     n = rng.choice((1, 2, 8, 8))
@@ -400,21 +395,12 @@ def disturb(rng, filter):
 def stand_still(rng, filter, row):
     """Let the rest detector be content, with the largest bias against the opposite estimate."""
     s = filter.state
-    block = 1 << s[AT.BLOCK]
-    filter.set_bias(*(rng.choice((-(1 << 21), 1 << 21, 0)) for _ in range(3)))
-    most = s[AT.REST_MOST] // 4096
+    overflow.stand_still(rng, filter, row, AT)
     for i in range(3):
-        low = rng.choice((-most, most))
-        row[3 + i] = low + s[AT.BASE + i] // 256
-        s[AT.LOW1 + 3 + i] = s[AT.LOW2 + 3 + i] = low << 12
-        s[AT.GS + i] = row[3 + i] * (block - 1)
-        s[AT.LOW1 + i] = s[AT.LOW2 + i] = row[i] << 12
-        s[AT.AS + i] = row[i] * (block - 1)
+        s[AT.AS + i] = row[i] * ((1 << s[AT.BLOCK]) - 1)
     if rng.random() < 0.5:  # in free fall, so that nothing tells of a tilt
         for i in range(3):
             row[i] = s[AT.HS + i] = s[AT.AS + i] = s[AT.LOW1 + i] = s[AT.LOW2 + i] = 0
-    s[AT.BLOCKS] = 1000
-    s[AT.STILL] = rng.choice((s[AT.REST_AFTER], 0))
 
 
 def test_nothing_leaves_32_bits_at_the_corners_of_the_accepted_range(checked):
@@ -425,7 +411,8 @@ def test_nothing_leaves_32_bits_at_the_corners_of_the_accepted_range(checked):
         for _ in range(60):
             disturb(rng, filter)
             row = array(
-                "h", [word(rng) for _ in range(10)] + [rng.choice((3, 3, 3, 3, 7, 1, 0, 2))]
+                "h",
+                [overflow.word(rng) for _ in range(10)] + [rng.choice((3, 3, 3, 3, 7, 1, 0, 2))],
             )
             if rng.random() < 0.2:
                 row[6] = row[7] = row[8] = 0
@@ -439,36 +426,6 @@ def test_nothing_leaves_32_bits_at_the_corners_of_the_accepted_range(checked):
 
 
 # -- interface
-def test_it_coasts_on_the_last_gyro_words_without_feedback():
-    filter = QuaternionKalman9(200, SCALE, 4096)
-    run(filter, counts(flags=3), 200 * 4)
-    before = list(filter.state)
-    run(filter, counts(4096, 0, 0, gz=820, mx=-66, flags=2), 200)  # they disagree
-    out = array("i", [0] * 3)
-    filter.angles(out)
-    assert out[2] == pytest.approx(50000, abs=30)
-    assert abs(out[0]) < 30 and abs(out[1]) < 30
-    # nothing but the attitude and its remainders has changed
-    assert list(filter.state)[AT.G :] == before[AT.G :]
-
-
-def test_what_it_says_of_itself():
-    filter = QuaternionKalman9(200, SCALE, 4096)
-    assert (filter.resting, filter.mag_accepted) == (False, False)
-    row = counts(flags=3)
-    filter.seed(row)
-    run(filter, row, 200)
-    assert not filter.resting
-    run(filter, row, 400)
-    assert filter.resting and filter.mag_accepted
-    run(filter, counts(mx=0, my=400, flags=3), 200)
-    assert not filter.mag_accepted
-    rng = random.Random(1)
-    for _ in range(600):
-        filter.update(counts(*(rng.randint(-9000, 9000) for _ in range(3)), gx=400, flags=1))
-    assert not filter.resting and not filter.mag_accepted
-
-
 def test_six_axes_do_not_look_at_the_magnetometer():
     row, other = counts(flags=3), counts(mx=0, my=400, flags=3)
     out = array("i", [0] * 3)
@@ -479,28 +436,3 @@ def test_six_axes_do_not_look_at_the_magnetometer():
         filter.angles(out)
         assert abs(out[2] - (90000 if kind is QuaternionKalman6 else 0)) < 3000
         run(filter, other, 10)
-
-
-# -- what is refused
-def test_a_step_that_could_turn_by_too_much_is_refused():
-    with pytest.raises(ValueError, match=r"rate is 50 Hz, expected (\d+)..1439 Hz at") as caught:
-        QuaternionKalman9(50, SCALE, 2048)
-    low = int(re.search(r"expected (\d+)", str(caught.value)).group(1))
-    assert QuaternionKalman9(low, SCALE, 2048) and 50 < low <= 60
-    with pytest.raises(ValueError):
-        QuaternionKalman9(low - 1, SCALE, 2048)
-
-
-@pytest.mark.parametrize(
-    "parameters, said",
-    [
-        ({"gyro_noise": 0}, "gyro_noise is 0, expected 0.001..1"),
-        ({"mag_noise": 0.3}, "mag_noise is 0.3, expected 0.01..0.2"),
-        ({"bias_start": "6"}, "bias_start is '6', expected a number"),
-        ({"bias_walk": 0.1, "bias_start": 1}, "bias_walk is 0.1, expected no more than 1/20"),
-        ({"tau": 3}, "no parameter 'tau'"),
-    ],
-)
-def test_a_parameter_that_cannot_be_is_refused(parameters, said):
-    with pytest.raises((ValueError, TypeError), match=re.escape(said)):
-        QuaternionKalman9(200, SCALE, 2048, **parameters)
