@@ -732,7 +732,7 @@ def test_a_batch_that_the_fifo_cannot_hold_is_refused(batch):
 def checked():
     """(watch, modules) with checked viper functions; at the end nothing may have gone unexercised."""
     watch = overflow.Watch()
-    names = ("fixmath.py", "mpu_monitor.py", "mpu_fifo.py", "dmp_setup.py", "dmp.py")
+    names = ("fixmath.py", "mpu_monitor.py", "mpu_fifo.py", "dmp.py")
     return watch, overflow.loaded([LIB / name for name in names], watch)
 
 
@@ -771,7 +771,7 @@ def test_no_intermediate_leaves_32_bits_whatever_is_in_a_packet(checked, image, 
             assert list(dmp.state) == before  # nothing of it is taken
             continue
         good += 1
-        dmp._turn()
+        modules["dmp"]._turn(dmp._s)
         q = [w / 2**29 for w in dmp.state[1:5]]
         assert math.sqrt(sum(x * x for x in q)) == pytest.approx(math.sqrt(length), abs=2e-4)
     assert good > 300
@@ -790,7 +790,7 @@ def test_an_unjudged_packet_would_overflow(checked):
         dmp.state[14 + i] = 32768 if dmp.state[14 + i] > 0 else -32768
     dmp.state[5:9] = array("i", [2 * ONE - 1 if t > 0 else -2 * ONE for t in dmp.state[14:18]])
     with pytest.raises(overflow.Overflow):
-        dmp._turn()
+        modules["dmp"]._turn(dmp._s)
 
 
 # -- every runtime

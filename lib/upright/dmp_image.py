@@ -1,5 +1,6 @@
-# DMP images of the InvenSense MPU6050 family as files: which there are, what they are to hold, how they are read.
-# The images are InvenSense's and not part of this library. Needs nothing; runs on MicroPython >= 1.22 and on hosts.
+# DMP images of the InvenSense MPU6050 family: as files (which there are, what they are to hold, how they are read), and
+# in the chip's memory. The images are InvenSense's and not part of this library. Needs nothing; runs on
+# MicroPython >= 1.22 and on hosts.
 
 import io
 from binascii import hexlify
@@ -8,6 +9,11 @@ try:
     from hashlib import sha256
 except ImportError:  # a port built without it: every image is unknown there
     sha256 = None
+
+# Registers, by their names in InvenSense's motion driver 6.12 (inv_mpu.c); not in RM-MPU-6000A
+_BANK_SEL = 0x6D  # MEM_START_ADDR 0x6E follows: one write of two bytes sets both
+_MEM_R_W = 0x6F
+PROGRAM_START = 0x70  # PRGM_START_H: DMP_CFG_1, DMP_CFG_2
 
 CHUNK = 16
 BANK = 256
@@ -131,6 +137,67 @@ class DmpImage:
     def _close(self, file):
         if isinstance(self._source, str):
             file.close()
+
+
+class DmpMemory:
+    """The DMP's memory and program start, written through a driver's registers; `advice()` ends a message."""
+
+    def __init__(self, registers, advice):
+        self._registers = registers
+        self._advice = advice
+
+    def load(self, image, divider):
+        """The image, read back as a whole: memory that is smaller than it claims gives itself away. Then what follows
+        it in the file, and the divider."""
+        for address, data in image.pieces():
+            self._put(address, data)
+        for address, data in image.pieces():
+            self._verify(address, data)
+        for address, data in image.patches():
+            self._put(address, data)
+            self._verify(address, data)
+        data = bytes((0, divider))
+        self._put(DIVIDER, data)
+        self._verify(DIVIDER, data)
+
+    def write(self, register, data):
+        """A burst; raises MpuDmpError."""
+        try:
+            self._registers.write_from(bytes((register,)) + data)
+            return
+        except OSError as e:
+            fault = e
+        raise MpuDmpError("bus error (%s) while writing register 0x%02x" % (fault, register))
+
+    def _point(self, address):
+        self.write(_BANK_SEL, bytes(_at(address)))
+
+    def _put(self, address, data):
+        try:
+            self._point(address)
+            self.write(_MEM_R_W, data)
+        except MpuDmpError as e:
+            raise MpuDmpError("loading the DMP's bank %d at 0x%02x: %s" % (_at(address) + (e,)))
+
+    def _verify(self, address, data):
+        found = bytearray(len(data))
+        try:
+            self._point(address)
+            self._registers.read_into(_MEM_R_W, found)
+        except OSError as e:
+            raise MpuDmpError(
+                "reading back the DMP's bank %d at 0x%02x: %s" % (_at(address) + (e,))
+            )
+        for i in range(len(data)):
+            if found[i] != data[i]:
+                raise MpuDmpError(
+                    "the DMP's memory, bank %d at 0x%02x: wrote 0x%02x, read 0x%02x. %s"
+                    % (_at(address + i) + (data[i], found[i], self._advice()))
+                )
+
+
+def _at(address):
+    return address >> 8, address & 0xFF
 
 
 def _hash(file):

@@ -35,7 +35,7 @@ MOVED = {
     "mpu_setup": "upright.mpu",
     "mpu_dmp": "upright.dmp",
     "mpu_dmp_image": "upright.dmp_image",
-    "mpu_dmp_setup": "upright.dmp_setup",
+    "mpu_dmp_setup": "upright.dmp",
     "ssd1306_canvas": "upright.canvas",
     "ssd1306_font": "upright.font",
 }  # fmt: skip
