@@ -120,31 +120,7 @@ class Inertial9(EarthFilter):
     gyro_scale        (num, den): exact LSB per deg/s
     accel_lsb_per_g   int, 64..32767
 
-    Times in s, angles in rad, all taken to six significant digits:
-
-    tau_tilt        3      time constant of the tilt correction, 0.5..30
-    tau_heading     10     the same for the heading, 1..100
-    tau_doubt       2      the same while nothing is known of the vertical bias; with knowledge it grows, 1..100
-    ramp_tilt       0.5    at the start the time constants are this times the time since, in 1/256, 0.1..4
-    ramp_heading    0.75
-    bias_after      5      no bias estimation in motion before this time, 0..60
-    bias_limit_dps  6      a bias is no larger than this (on top of set_bias), deg/s, 0.5..25
-    rest_gyro_dps   2      at rest the gyro stays this near to its average, deg/s, 0.1..10
-    rest_accel_g    0.051  and the accelerometer this near to its own, g, 0.01..0.1
-    rest_after      1.5    for this long, 0.2..10
-    rest_dps        0.5    a well-known bias does not change by more: a slow turn is not rest, deg/s, 0.05..5
-    upset_g         0.25   a tilt error at rest, as its sine, that restarts the ramps, 0.1..2
-    field_tolerance 0.2    a field that differs by less is that of the reference, as a part of it, 0.02..0.7
-    field_after     0.3    for this long, 0..10
-    field_tau       20     time constant with which the reference follows, 1..100
-    field_first     5      a field that stays the same for this long is the first reference, 0..100
-    field_new       20     the same for another one, counted while turning, 1..1000
-    field_dps       20     turning: faster than this, deg/s, 1..30
-    field_agree     0.5    a new reference's north is no further from the gyro's than this, rad, 0.05..3.14
-    reject_for      60     rejected for longer, a field counts half, 0..1000
-    restart_rad     0.55   a heading error that a good field does not explain, 0.1..3.14
-    restart_after   5      restarts the heading's ramp when it lasts this long, 0.5..100
-    outage          0.5    so long without a fresh sample restarts both ramps, 0.05..10
+    parameters        by name, see PARAMETERS; taken to six significant digits
 
     A steady rotation from power-on on looks like a bias and is taken for one, up to bias_limit_dps. The first 1.5 s at
     rest settle it.
@@ -158,31 +134,34 @@ class Inertial9(EarthFilter):
     NAME = "inertial9"
     AXES = 9
     LITE = False  # True: no rejection of fields, no restart of the heading
+    # name: (default, least, most); times in s, angles in rad
+    # fmt: off
     PARAMETERS = {
-        "tau_tilt": (3, 0.5, 30),
-        "tau_heading": (10, 1, 100),
-        "tau_doubt": (2, 1, 100),
-        "ramp_tilt": (0.5, 0.1, 4),
+        "tau_tilt": (3, 0.5, 30),  # time constant of the tilt correction
+        "tau_heading": (10, 1, 100),  # the same for the heading
+        "tau_doubt": (2, 1, 100),  # the same while nothing is known of the vertical bias; with knowledge it grows
+        "ramp_tilt": (0.5, 0.1, 4),  # at the start the time constants are this times the time since, in 1/256
         "ramp_heading": (0.75, 0.1, 4),
-        "bias_after": (5, 0, 60),
-        "bias_limit_dps": (6, 0.5, 25),
-        "rest_gyro_dps": (2, 0.1, 10),
-        "rest_accel_g": (0.051, 0.01, 0.1),
-        "rest_after": (1.5, 0.2, 10),
-        "rest_dps": (0.5, 0.05, 5),
-        "upset_g": (0.25, 0.1, 2),
-        "field_tolerance": (0.2, 0.02, 0.7),
-        "field_after": (0.3, 0, 10),
-        "field_tau": (20, 1, 100),
-        "field_first": (5, 0, 100),
-        "field_new": (20, 1, 1000),
-        "field_dps": (20, 1, 30),
-        "field_agree": (0.5, 0.05, 3.14),
-        "reject_for": (60, 0, 1000),
-        "restart_rad": (0.55, 0.1, 3.14),
-        "restart_after": (5, 0.5, 100),
-        "outage": (0.5, 0.05, 10),
+        "bias_after": (5, 0, 60),  # no bias estimation in motion before this time
+        "bias_limit_dps": (6, 0.5, 25),  # a bias is no larger than this (on top of set_bias), deg/s
+        "rest_gyro_dps": (2, 0.1, 10),  # at rest the gyro stays this near to its average, deg/s
+        "rest_accel_g": (0.051, 0.01, 0.1),  # and the accelerometer this near to its own, g
+        "rest_after": (1.5, 0.2, 10),  # for this long
+        "rest_dps": (0.5, 0.05, 5),  # a well-known bias does not change by more: a slow turn is not rest, deg/s
+        "upset_g": (0.25, 0.1, 2),  # a tilt error at rest, as its sine, that restarts the ramps
+        "field_tolerance": (0.2, 0.02, 0.7),  # a field that differs by less is the reference's, as a part of it
+        "field_after": (0.3, 0, 10),  # for this long
+        "field_tau": (20, 1, 100),  # time constant with which the reference follows
+        "field_first": (5, 0, 100),  # a field that stays the same for this long is the first reference
+        "field_new": (20, 1, 1000),  # the same for another one, counted while turning
+        "field_dps": (20, 1, 30),  # turning: faster than this, deg/s
+        "field_agree": (0.5, 0.05, 3.14),  # a new reference's north is no further from the gyro's than this
+        "reject_for": (60, 0, 1000),  # rejected for longer, a field counts half
+        "restart_rad": (0.55, 0.1, 3.14),  # a heading error that a good field does not explain
+        "restart_after": (5, 0.5, 100),  # restarts the heading's ramp when it lasts this long
+        "outage": (0.5, 0.05, 10),  # so long without a fresh sample restarts both ramps
     }
+    # fmt: on
 
     def __init__(self, rate, gyro_scale, accel_lsb_per_g, **parameters):
         EarthFilter.__init__(self, rate, gyro_scale, accel_lsb_per_g, _WORDS, parameters)

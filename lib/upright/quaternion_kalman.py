@@ -221,25 +221,7 @@ class QuaternionKalman9(EarthFilter):
     gyro_scale        (num, den): exact LSB per deg/s
     accel_lsb_per_g   int, 64..32767
 
-    All taken to six significant digits:
-
-    gyro_noise       0.043   random walk of the attitude, vibration included, deg/s per root Hz, 0.001..1
-    bias_walk        0.0033  random walk of the bias, deg/s per root s, 0..0.1, no more than bias_start / 20
-    scale_error      0.007   the faster the body turns, the less the gyro is believed: noise of so many times the rate
-                             per root Hz, 0..0.02; a quarter of it about the vertical
-    accel_noise      0.1     of the tilt from one block of the accelerometer, g, where so little is known of the tilt
-                             (15 deg) that it is believed as it is, 0.02..1
-    velocity_noise   1.1     m/s per root Hz, 0.1..2
-    mag_noise        0.15    of the heading, rad per root Hz, 0.01..0.2
-    bias_start       3.3     first sigma of the bias (on top of set_bias), which is no larger than 2.5 of them, deg/s,
-                             0.5..10
-    bias_after       5       nothing but rest tells of the bias before this time, s, 0..60: a start in motion is a
-                             wrong start, and its corrections are not those of a bias
-    rest_noise       0.03    of the averaged gyro at rest, deg/s per root Hz, 0.01..1
-    rest_gyro_dps    2       at rest the gyro's mean of a block stays this near to its average, deg/s, 0.1..10
-    rest_accel_g     0.05    and the accelerometer's this near to its own, g, 0.01..0.1
-    rest_after       1.5     for this long, s, 0.2..10
-    field_tolerance  0.2     a field that differs by less is that of the reference, as a part of it, 0.02..0.7
+    parameters        by name, see PARAMETERS; taken to six significant digits
 
     Limits: a push that lasts (0.3 g for 5 s) is taken for a tilt; a kick that the gyro has not seen is forgotten at
     once at rest, but only within 15 s in motion; a steady rotation from power-on on looks like a bias and is taken for
@@ -253,21 +235,31 @@ class QuaternionKalman9(EarthFilter):
 
     NAME = "quaternion-kalman9"
     AXES = 9
+    # name: (default, least, most)
+    # fmt: off
     PARAMETERS = {
-        "gyro_noise": (0.043, 0.001, 1),
-        "bias_walk": (0.0033, 0, 0.1),
+        "gyro_noise": (0.043, 0.001, 1),  # random walk of the attitude, vibration included, deg/s per root Hz
+        "bias_walk": (0.0033, 0, 0.1),  # random walk of the bias, deg/s per root s, no more than bias_start / 20
+        # the faster the body turns, the less the gyro is believed: noise of so many times the rate per root Hz;
+        # a quarter of it about the vertical
         "scale_error": (0.007, 0, 0.02),
+        # of the tilt from one block of the accelerometer, g, where so little is known of the tilt (15 deg) that it is
+        # believed as it is
         "accel_noise": (0.1, 0.02, 1),
-        "velocity_noise": (1.1, 0.1, 2),
-        "mag_noise": (0.15, 0.01, 0.2),
+        "velocity_noise": (1.1, 0.1, 2),  # m/s per root Hz
+        "mag_noise": (0.15, 0.01, 0.2),  # of the heading, rad per root Hz
+        # first sigma of the bias (on top of set_bias), which is no larger than 2.5 of them, deg/s
         "bias_start": (3.3, 0.5, 10),
+        # nothing but rest tells of the bias before this time, s: a start in motion is a wrong start, and its
+        # corrections are not those of a bias
         "bias_after": (5, 0, 60),
-        "rest_noise": (0.03, 0.01, 1),
-        "rest_gyro_dps": (2, 0.1, 10),
-        "rest_accel_g": (0.05, 0.01, 0.1),
-        "rest_after": (1.5, 0.2, 10),
-        "field_tolerance": (0.2, 0.02, 0.7),
+        "rest_noise": (0.03, 0.01, 1),  # of the averaged gyro at rest, deg/s per root Hz
+        "rest_gyro_dps": (2, 0.1, 10),  # at rest the gyro's mean of a block stays this near to its average, deg/s
+        "rest_accel_g": (0.05, 0.01, 0.1),  # and the accelerometer's this near to its own, g
+        "rest_after": (1.5, 0.2, 10),  # for this long, s
+        "field_tolerance": (0.2, 0.02, 0.7),  # a field that differs by less is the reference's, as a part of it
     }
+    # fmt: on
 
     def __init__(self, rate, gyro_scale, accel_lsb_per_g, **parameters):
         EarthFilter.__init__(self, rate, gyro_scale, accel_lsb_per_g, _WORDS, parameters)
