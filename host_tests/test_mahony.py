@@ -48,7 +48,7 @@ def history(filter_history):
 
     def run(rendered, kp, ki, every=0, bias=()):
         options = {"gains": with_gains(kp, ki), "bias": bias, "mag_every": every}
-        return filter_history(rendered, f"mahony{9 if every else 6}", **options).q29
+        return filter_history(quickest(), rendered, f"mahony{9 if every else 6}", **options).q29
 
     return run
 
