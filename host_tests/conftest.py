@@ -1,6 +1,7 @@
 """What every test shares: the board's search path under CPython, a fresh simulated machine, and the runtimes."""
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -31,6 +32,9 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("upright")
 
+
+# What an ordinary user of Debian may have open: who forgets to close fails here as well.
+OPEN_FILES = 1024
 
 # The recorded trials that tests hold to figures; others in the folder change nothing.
 TRIALS = (
@@ -66,6 +70,9 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft > OPEN_FILES or soft == resource.RLIM_INFINITY:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (OPEN_FILES, hard))
     chosen = config.getoption("--runtimes")
     if chosen:
         unknown = set(chosen.split(",")) - set(runtimes.LISTED)

@@ -1,6 +1,7 @@
 """A board for tests of what the host does to one: MicroPython's unix port in a folder that is its file system, driven
 through mpremote's interface, and able to lose power before any of its commands and any change of its file system."""
 
+import contextlib
 import json
 import subprocess
 
@@ -144,6 +145,7 @@ class UnixBoard(Transport):
             self._process.stdin.write(json.dumps(command) + "\n")
             self._process.stdin.flush()
         except BrokenPipeError:
+            self.close()
             raise PowerCut from None
         answer = self._process.stdout.readline()
         if not answer:
@@ -165,6 +167,9 @@ class UnixBoard(Transport):
     def close(self):
         self._process.kill()
         self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            with contextlib.suppress(BrokenPipeError):
+                pipe.close()
 
 
 def boot(folder, left=None, then=""):
