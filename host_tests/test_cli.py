@@ -207,7 +207,7 @@ def test_what_is_not_here_is_exit_code_3(upright, trial, monkeypatch):
     ):
         done = upright(*words)
         assert (done.exit_code, done.stdout) == (3, "")
-        assert re.fullmatch(r"runtime \w+ cannot be had here: no mirror\n", done.stderr)
+        assert re.fullmatch(r"runtime \w+ is not available here: no mirror\n", done.stderr)
 
 
 def test_a_simulation_that_dies_is_told_with_its_last_words(tmp_path):

@@ -90,7 +90,9 @@ def add_extras():
         # one after the other: what has no wheel here is not to take the others with it
         for package in extras[name]:
             if subprocess.run([*pip, package]).returncode:
-                print(f"setup: {package} cannot be had here; tests that need it skip", flush=True)
+                print(
+                    f"setup: {package} is not available here; tests that need it skip", flush=True
+                )
     EXTRAS.write_text(stamp())
 
 

@@ -1,5 +1,5 @@
-# ESP32 (DevKitC and alike): its timers call back in the main program's time only; see README.md for the wiring.
-# What can be set besides is in lib/upright/settings.py.
+# ESP32 (DevKitC and similar): its timer callbacks are soft; see README.md for the wiring.
+# lib/upright/settings.py lists every setting.
 
 from machine import I2C, Pin
 from upright import ssd1306, timing
@@ -9,7 +9,7 @@ NAME = "ESP32"
 PLATFORM = "esp32"  # sys.platform there
 SENSOR_RATE_HZ = 1000
 
-# A stuck bus costs a tick at most this long (us).
+# A stuck bus blocks a tick for this long at most (us).
 _TIMEOUT_US = 3000
 
 _i2c = I2C(0, scl=Pin(22), sda=Pin(21), freq=400000, timeout=_TIMEOUT_US)

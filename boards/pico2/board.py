@@ -1,5 +1,5 @@
 # Raspberry Pi Pico 2 (RP2350), MicroPython 1.26 or newer for hard timer interrupts; see README.md for the wiring.
-# What can be set besides is in lib/upright/settings.py.
+# lib/upright/settings.py lists every setting.
 
 from machine import I2C, Pin
 from upright import ssd1306, timing
@@ -9,7 +9,7 @@ NAME = "Raspberry Pi Pico 2"
 PLATFORM = "rp2"  # sys.platform there
 SENSOR_RATE_HZ = 1000
 
-# A stuck bus costs a tick at most this long (us).
+# A stuck bus blocks a tick for this long at most (us).
 _TIMEOUT_US = 3000
 
 _i2c = I2C(0, scl=Pin(5), sda=Pin(4), freq=400000, timeout=_TIMEOUT_US)

@@ -1,5 +1,5 @@
 # RoboMaster development board A (STM32F427IIH6): MPU6500 on SPI5, IST8310 on its auxiliary bus, OLED on SPI1.
-# Everything is on the board but the OLED; see README.md. What can be set besides is in lib/upright/settings.py.
+# Everything is on the board but the OLED; see README.md. lib/upright/settings.py lists every setting.
 
 import time
 
@@ -18,18 +18,18 @@ DISPLAY_SHARES_BUS = False  # SPI1 is the OLED's alone: the main program writes 
 
 # The frame of the MPU6500, as its data sheet draws it on the package, is the body's.
 IMU_AXES = ("x", "y", "z")
-# UNVERIFIED on silicon: nobody has yet run the axis check of README.md on this board; until then trust roll and pitch,
-# not yaw. Where it comes from: the vendor's own firmware for this board turns the magnetometer's words so
-# (RoboMaster/RoboRTS-Firmware, bsp/boards/drv_imu.c, mpu_get_data). It mirrors once, as it must: the IST8310's frame is
-# left-handed (PX4, IST8310.cpp; ArduPilot, AP_Compass_IST8310.cpp). The vendor's older example
+# UNVERIFIED on a real board: the axis check of README.md has not been run yet. Until then trust roll and pitch, not
+# yaw. The source: the vendor's own firmware for this board maps the magnetometer's words this way
+# (RoboMaster/RoboRTS-Firmware, bsp/boards/drv_imu.c, mpu_get_data). It mirrors once, as required: the IST8310's frame
+# is left-handed (PX4, IST8310.cpp; ArduPilot, AP_Compass_IST8310.cpp). The vendor's older example
 # (RoboMaster/DevelopmentBoard-Examples, Imu) has no map at all.
 MAG_AXES = ("y", "-x", "-z")
 
-# TIM7 has no outputs, so nothing on the board can want it; its callbacks are hard. TIM1, 2, 4, 5, 8 and 12 drive the
+# TIM7 has no outputs, so nothing else on the board uses it; its callbacks are hard. TIM1, 2, 4, 5, 8 and 12 drive the
 # servo and buzzer connectors, TIM3 the heater; MicroPython takes TIM5 for servos and TIM6 for timed ADC and DAC.
 _TICK_TIMER = 7
 
-# SPI1 and SPI5 hang on APB2 (84 MHz) behind a power of two from 2 to 256: 1 MHz asked for is 656 kHz, 20 MHz is 10.5.
+# SPI1 and SPI5 hang on APB2 (84 MHz) behind a power of two from 2 to 256: 1 MHz becomes 656 kHz, 20 MHz becomes 10.5.
 _IMU_HZ = 1000000
 _OLED_HZ = 5250000  # an SSD1306 takes up to 10 MHz, an SH1106 up to 2 MHz
 
@@ -43,7 +43,7 @@ def sensor():
 
 
 def magnetometer(imu):
-    # A processor's reset does not reset the chip; its pin does, low. Then it needs up to 50 ms.
+    # A reset of the processor does not reset the chip; its reset pin does, low. Then it needs up to 50 ms.
     _mag_reset(0)
     time.sleep_ms(1)
     _mag_reset(1)

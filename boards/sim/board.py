@@ -1,5 +1,5 @@
 # The simulated board that `upright demo` and the tests boot: wired like the Pico of boards/pico.
-# What can be set besides is in lib/upright/settings.py.
+# lib/upright/settings.py lists every setting.
 
 from machine import I2C, Pin
 from upright import ssd1306, timing

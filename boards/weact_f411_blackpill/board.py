@@ -1,5 +1,5 @@
 # WeAct Black Pill (STM32F411CE), MicroPython's WEACT_F411_BLACKPILL; see README.md for the wiring.
-# What can be set besides is in lib/upright/settings.py.
+# lib/upright/settings.py lists every setting.
 
 from machine import I2C, Pin
 from upright import ssd1306, timing
@@ -9,7 +9,7 @@ NAME = "WeAct F411 Black Pill"
 PLATFORM = "pyboard"  # sys.platform there
 SENSOR_RATE_HZ = 1000
 
-# A stuck bus costs a tick at most this long (us, whole milliseconds on this port).
+# A stuck bus blocks a tick for this long at most (us, whole milliseconds on this port).
 _TIMEOUT_US = 3000
 
 _i2c = I2C(1, freq=400000, timeout=_TIMEOUT_US)  # PB6, PB7

@@ -1,4 +1,4 @@
-# The application: starts the board's sensors and shows on the display what comes out, through upright's face alone.
+# The application: starts the board's AHRS and shows the angles on the display. It uses only the calls of `upright`.
 # Needs board.py. Every port.
 
 import time
@@ -33,7 +33,7 @@ class App:
             machine.idle()
 
     def start(self):
-        """Until the sensor answers. Raises ValueError for a setting that cannot be had: board.py has to change."""
+        """Try until the sensor answers. Raises ValueError for a wrong setting: board.py must change."""
         imu = self.imu
         print("upright on", imu.board)
         while True:
@@ -87,7 +87,7 @@ class App:
         self.imu.display.show()
 
     def _fill_status(self, status):
-        """What the status page shows, as far as this filter tells it."""
+        """Fill the words of the status page; a filter without a value leaves -1."""
         words = self._status
         for i in range(3):
             words[pages.BIAS + i] = round(status["bias_dps"][i] * 1000)
@@ -99,7 +99,7 @@ class App:
             words[pages.FIELD] = 0 if lost else 1 if status["field_accepted"] else 2
 
     def say(self, title, *lines):
-        """A message on the display while the main program owns its bus; the console has its own words."""
+        """Show a message on the display while the main program owns its bus. The console has its own messages."""
         display = self.imu.display
         if display is not None:
             self._pages.message(title, *lines)

@@ -1,11 +1,12 @@
-# Axis maps found from samples: how the chips sit on a board, by gravity, by the gyro, and by the field, which stands
-# still while the board turns. Used by doctor.py. Every port. It uses floats and allocates: not for the tick.
+# Finds the axis maps from samples: how the chips are mounted on a board, by gravity, by the gyro, and by the field,
+# which stands still while the board turns. Used by doctor.py. Every port. It uses floats and allocates: not for the
+# tick.
 
 import math
 
 from micropython import const
 
-_DOMINANT = 0.85  # of 1 g on one axis: the board leans by less than 30 deg
+_DOMINANT = 0.85  # of 1 g on one axis: the tilt is less than 30 deg
 
 _COUNTS_PER_UNIT = 100.0  # of the field, in the sums: keeps them near 1 (30 uT of an IST8310)
 # An interval of the tumble is closed when the board has turned this far (rad): the field then changes by several
@@ -17,7 +18,9 @@ _TURNS_LEAST = const(60)
 # Part of the field's changes that a map leaves unexplained: noise alone leaves up to 0.1, a wrong map about 1.
 _SCORE_MOST = 0.35
 _SECOND_LEAST = 2.0  # times the best
-_DIP_LEAST = 0.25  # sine; nearer to the magnetic equator up and down are too alike
+_DIP_LEAST = (
+    0.25  # sine of the dip; nearer to the magnetic equator up and down cannot be distinguished
+)
 
 
 def parse(axes):
@@ -53,7 +56,7 @@ def up_axis(accel, lsb_per_g):
 def imu_axes(level, nose_up, left_up):
     """The IMU's map, from the chip's axis (index, sign) that points up in each of three postures.
 
-    Raises ValueError where they cannot be those postures.
+    Raises ValueError if these cannot be the three postures.
     """
     axes = [nose_up, left_up, level]
     if len({index for index, _ in axes}) < 3:
@@ -69,11 +72,11 @@ def imu_axes(level, nose_up, left_up):
 
 
 class Tumble:
-    """Finds how a magnetometer sits beside a gyro: the field stands still in space, so in the body it turns against
-    the gyro, dm/dt = -w x m, and only with the right map does it do so.
+    """Finds how a magnetometer is mounted beside a gyro. The field stands still in space, so in the body it turns
+    against the gyro, dm/dt = -w x m, but only with the right map.
 
-    A map and its opposite explain the turning equally well; which of the two it is, says the field's vertical part:
-    down in the northern hemisphere. A hard-iron offset is solved for along with each map.
+    A map and its opposite explain the rotation equally well. The vertical part of the field decides between them: it
+    points down in the northern hemisphere. A hard-iron offset is solved for with each map.
 
     Memory is bounded: only sums over the intervals are kept.
     """
@@ -242,7 +245,7 @@ class Tumble:
 
 
 class Verdict:
-    """What a tumble has shown.
+    """The result of a tumble.
 
     problem  None, or why the map is not certain
     axes     the magnetometer's map, None where none can be told; score, second: what it and the next best class of
@@ -290,7 +293,7 @@ def needle_turn(before, after, axes, offset):
 
 
 def judge_turn(gyro_deg, needle_deg):
-    """The quarter turn to the left, level: what the gyro and the field say of it -> list of problems."""
+    """Compare gyro and field in the level quarter turn to the left -> list of problems."""
     problems = []
     if not 60 < abs(gyro_deg) < 120:
         problems.append("the gyro saw a turn by %d deg, not 90: turn once more" % gyro_deg)

@@ -1,5 +1,5 @@
-# A board's doctor: who answers, which rates are kept, and whether the axis maps in board.py are right.
-# On the board, with nothing else running: import board, doctor; doctor.report(board); doctor.axes(board).
+# A board's doctor: which chips answer, which rates are kept, and whether the axis maps in board.py are right.
+# `upright doctor` runs it; on the board: from upright_app import doctor; import board; doctor.report(board).
 # Every port. It uses floats and allocates: not for the tick. The functions that judge take samples, not chips.
 
 import gc
@@ -13,10 +13,10 @@ from upright.settings import Settings, of_board
 
 from upright_app import axis_check
 
-_RATE_HZ = const(200)  # of the axis check: what a loop in bytecode can follow
+_RATE_HZ = const(200)  # of the axis check: a loop in bytecode keeps up with it
 _POLL_US = const(500)
 _MEASURE_MS = const(500)
-_POSTURE_MS = const(60000)  # for each posture; then the check is given up
+_POSTURE_MS = const(60000)  # for each posture; then the check ends
 _STILL_MS = const(1000)
 _TUMBLE_MS = const(30000)
 _STILL_DPS = const(6)
@@ -30,8 +30,8 @@ class Source:
     """The chips of a board, read from the main program: next() gives each fresh sample once."""
 
     def __init__(self, board, rate_hz=None):
-        """Opens them. Raises OSError when the sensor does not answer; mag is None without a magnetometer, and mag_fault
-        says why there is none where one belongs."""
+        """Opens the chips. Raises OSError when the sensor does not answer. mag is None without a magnetometer;
+        mag_fault says why one of board.py does not work."""
         self.config = settings = Settings(of_board(board))
         self.imu = imu = board.sensor()
         imu.configure(
@@ -51,7 +51,7 @@ class Source:
         self._own_mag = self.mag if self.mag is not None and self.mag.own_bus else None
         self.counts = imu.counts
         num, den = imu.sample_rate
-        self._early_us = 800000 * den // num  # so long after a sample there cannot be another
+        self._early_us = 800000 * den // num  # no other sample comes within this time
         self.seconds = 0.0  # between the last two fresh samples
         self._at = time.ticks_us()
 
@@ -81,7 +81,7 @@ class Source:
 
 
 class Posture:
-    """Waits until the board lies still, and has the mean of what it then measured."""
+    """Waits until the board lies still, and holds the mean of its samples then."""
 
     def __init__(self, source):
         self._source = source
@@ -104,7 +104,7 @@ class Posture:
                 flags = source.next()
                 if first is None:
                     first = [counts[3 + i] for i in range(3)]
-                # the gyro may be biased: still means that it does not change
+                # the gyro has a bias: at rest means that its reading does not change
                 if (
                     max(abs(counts[3 + i] - first[i]) for i in range(3))
                     > _STILL_DPS * self._num // self._den
@@ -135,7 +135,7 @@ class Posture:
 def axes(board, south=False, tumble_ms=_TUMBLE_MS):
     """The two-minute check of IMU_AXES and MAG_AXES: says what to do, waits for it, and says what is wrong.
 
-    Nothing has to be typed: each step goes on when the board lies still as it should. Returns the list of problems.
+    Nothing has to be typed: each step goes on when the board lies still in its position. Returns the list of problems.
     """
     upright.stop()
     problems = []
@@ -265,7 +265,8 @@ class _Counter:
 
 
 def report(board):
-    """Who answers, which rates are kept, what is free: printed; returns the list of problems, each with what to do."""
+    """Print which chips answer, which rates are kept, how much memory is free. Returns the list of problems, each with
+    what to do."""
     upright.stop()
     problems = []
     version = ".".join([str(x) for x in sys.implementation.version[:3]])

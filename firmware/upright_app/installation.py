@@ -1,6 +1,6 @@
-# Finishes an installation of Upright that was cut off. `upright flash` puts this file as /upright.py in front of
-# lib/upright, with a call of one of the two functions below it, and takes it away at the end: so `import upright`
-# runs it first, whatever state lib/upright is in. Needs no other file of Upright. Every port.
+# Finishes an interrupted installation of Upright. `upright flash` copies this file to /upright.py, with a call of one
+# of its two functions, and removes it at the end. /upright.py comes before lib/upright on the path, so `import upright`
+# runs it first in any state of lib/upright. Needs no other file of Upright. Every port.
 
 import os
 import sys
@@ -14,7 +14,7 @@ SELF = "upright.py"
 def finish(install, remove):
     """Put the staged files under their names, then remove what is named.
 
-    Done again from the start after any interruption: every step either has been done or can be.
+    After an interruption it starts from the beginning: every step has either been done or can be done.
     """
     is_new_main = False
     for i in range(len(install)):
@@ -34,8 +34,8 @@ def finish(install, remove):
 
 
 def refuse(names):
-    """The board has no room for old and new files together, and was cut off between them. names: whose files
-    they are, for the next installation."""
+    """The board has no room for old and new files together, and the installation was interrupted between them. names:
+    the files of Upright, for the next installation."""
     if __name__ == "upright":
         raise ImportError("an installation of Upright was cut off: run `upright flash` again")
 
@@ -66,7 +66,7 @@ def _restart():
 
 
 def _give_way():
-    """Whoever imports this gets the package that has just been installed."""
+    """The program that imports this gets the package that has just been installed."""
     del sys.modules["upright"]
     package = __import__("upright")
     for name in dir(package):

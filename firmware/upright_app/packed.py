@@ -1,6 +1,6 @@
-# Stands for lib/upright/__init__ where the file system has no room for the modules as they are: it unpacks each as it
-# is imported. The modules lie beside it as NAME.z, compressed .mpy files; the package's own __init__ is init.z.
-# `upright flash` installs it where it has to. Needs deflate; every port that has that.
+# Replaces lib/upright/__init__ on a board whose file system is too small: it unpacks each module when it is imported.
+# The modules are beside it as NAME.z, compressed .mpy files; the package's own __init__ is init.z. `upright flash`
+# installs it when necessary. Needs deflate; runs on every port that has it.
 
 import os
 

@@ -13,9 +13,9 @@ NUMBERS = const(0)
 HORIZON = const(1)
 STATUS = const(2)
 
-# words of what the status page shows, array('i')
+# words of the status page, array('i')
 REST = const(0)  # 1: at rest, 0: moving, -1: the filter does not say
-FIELD = const(1)  # 1: used, 2: rejected, 0: there is none, -1: six axes
+FIELD = const(1)  # 1: used, 2: rejected, 0: no field, -1: six axes
 BIAS = const(2)  # 3: the gyro's, millidegrees/s
 DOUBT = const(5)  # how far the heading may be off, millidegrees; -1: the filter does not say
 STATUS_WORDS = const(6)
@@ -23,7 +23,7 @@ STATUS_WORDS = const(6)
 # flags of draw()
 BIAS_UNKNOWN = const(1)  # the gyro's bias was not measured: the yaw drifts
 SENSOR_LOST = const(2)  # no fresh sample: the angles are old
-MAG_LOST = const(4)  # nine axes were asked for, but there is no magnetometer now: the yaw drifts
+MAG_LOST = const(4)  # a nine-axis filter has no magnetometer now: the yaw drifts
 
 _PANEL = const(42)  # columns right of the horizon, for the figures
 _LADDER = const(10)  # degrees between the rungs of the pitch ladder
@@ -110,7 +110,7 @@ class Pages:
     def draw(self, page, angles, rate_hz, temperature, faults, flags, status=None):
         """Draws a page into the display's buffer; the caller then calls display.show().
 
-        page: NUMBERS, HORIZON, or STATUS; this wants `status`, an array('i') of STATUS_WORDS. angles:
+        page: NUMBERS, HORIZON, or STATUS, which needs `status`, an array('i') of STATUS_WORDS. angles:
         array('i') of roll, pitch, yaw in millidegrees, within +-180000. rate_hz: samples per second.
         temperature: centidegrees Celsius. faults: a count.
         flags: BIAS_UNKNOWN, SENSOR_LOST, MAG_LOST.

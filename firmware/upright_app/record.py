@@ -1,5 +1,5 @@
-# Records raw counts for `upright calibrate`; `upright record` brings it into the board's RAM and takes the rows.
-# Needs upright/settings.py and a board.py. Every port; takes the place of the application while it runs.
+# Records raw counts for `upright calibrate`. `upright record` loads it into the board's RAM and receives the rows.
+# Needs upright/settings.py and a board.py. Every port; the application must not run meanwhile.
 
 import json
 import os
@@ -11,18 +11,18 @@ from micropython import const
 from upright.settings import Settings, of_board
 
 _WORDS = const(11)
-_BLOCK = const(64)  # rows that are written at once: 1408 bytes
-_SPARE = const(8192)  # bytes of the file system that are left alone
+_BLOCK = const(64)  # rows to a write: 1408 bytes
+_SPARE = const(8192)  # bytes of the file system that stay free
 _SILENT_US = const(2000000)
 
 
 def run(path="recording.imu", seconds=60, rate_hz=100, board=None, file=None):
     """Write the counts of `seconds` to `path`, in the chips' own frames; Ctrl-C ends it earlier.
 
-    rate_hz  of the chip, and of the rows; 100 Hz is what a board's flash takes. Rows that were
-             missed while the flash was being written are in the file as not fresh.
+    rate_hz  of the chip and of the rows; a board's flash keeps up with 100 Hz. Samples that were missed during a write
+             have a row that is marked as not fresh.
     board    the board's module; None: board.py
-    file     what to write to (write, seek) in place of a file of that name
+    file     an object with write and seek, in place of a file of that name
 
     Returns the number of rows. Raises the driver's error when there is no sensor, OSError when the
     file cannot be written or is too large for the file system.
@@ -65,7 +65,7 @@ def _record(path, file, header, imu, mag, rows):
 
 
 class _Recorder:
-    """Rows into a file, in blocks. n: rows so far; lost: those of them that are not fresh."""
+    """Writes rows into a file, in blocks. n: rows so far; lost: rows that are not fresh."""
 
     def __init__(self, file, header, rows):
         self._file = file
@@ -79,8 +79,8 @@ class _Recorder:
     def record(self, imu, mag, num, den):
         period = 1000000 * den // num
         counts = imu.counts
-        # Between twice and three times a sample: the phase wanders, so that it never stays where a read falls between a
-        # sample and what the auxiliary bus brings to it, which would cost magnetometer samples
+        # 2.25 reads a sample: the phase moves on with each read. A fixed phase could fall between a sample and the
+        # bytes of the auxiliary bus, and magnetometer samples would be lost
         step = period * 4 // 9
         last = due = time.ticks_us()
         while self.n < self._rows:
@@ -88,7 +88,7 @@ class _Recorder:
             now = time.ticks_us()
             passed = time.ticks_diff(now, last)
             if flags & 1:
-                # one that is read by itself has its sample with one of the IMU's
+                # a magnetometer on a bus of its own is read with the IMU's sample
                 if mag is not None and mag.own_bus:
                     mag.read(counts)
                 missed = (passed + period // 2) // period - 1 if self.n else 0
@@ -119,8 +119,8 @@ class _Recorder:
             self._written = self.n
 
     def finish(self):
-        """The last rows, and their number where it is not the one that the header was begun with."""
-        # A Ctrl-C may have come between a block and its being counted: it is written again, in its place
+        """Write the last rows, and correct the number of rows in the header."""
+        # Ctrl-C may have come between a block's write and its count: the block is written again, in its place
         self._file.seek(len(self._header % self._rows) + self._written * 2 * _WORDS)
         self._file.write(memoryview(self._block)[: (self.n - self._written) * _WORDS])
         if self.n != self._rows:
@@ -131,7 +131,7 @@ class _Recorder:
 def _open(board, rate_hz):
     settings = Settings(of_board(board))
     imu = board.sensor()
-    # no dlpf: the filter follows the rate, so that nothing aliases
+    # no dlpf: the filter follows the rate, which prevents aliasing
     imu.configure(settings.ACCEL_RANGE_G, settings.GYRO_RANGE_DPS, sample_rate_hz=rate_hz)
     print("sensor: %s, %d/%d Hz" % ((imu.chip,) + imu.sample_rate))
     if not hasattr(board, "magnetometer"):
@@ -166,7 +166,7 @@ def _header(board, imu, mag, path):
 
 
 def _free(path):
-    """Bytes that may be written, or None where the port does not say."""
+    """Bytes that may be written, or None if the port does not say."""
     if not hasattr(os, "statvfs"):
         return None
     found = os.statvfs(path[: path.rfind("/") + 1] or ".")

@@ -1,5 +1,5 @@
-# The Euler-angle method with a fixed step in 32-bit integers: roll, pitch and yaw from the gyro, roll and pitch drawn
-# to what the accelerometer shows. Needs attitude.py, fixmath.py, euler_kernels.py and the viper emitter. update() is
+# The Euler-angle method with a fixed step in 32-bit integers: roll, pitch and yaw from the gyro, roll and pitch
+# corrected by the accelerometer. Needs attitude.py, fixmath.py, euler_kernels.py and the viper emitter. update() is
 # made for a hard interrupt: it allocates nothing, raises nothing, uses no float, and gives the same bits on every port.
 
 from array import array
@@ -26,7 +26,7 @@ _K = const(27)  # the part of the error that is taken up: K / 2**(K_SHIFT + 14)
 _K_SHIFT = const(28)  # 0..16
 _G = const(29)  # angle per step of one gyro count
 _GR = const(30)  # its last 15 bits, 0..32767
-_WR = const(31)  # 3: what rounding left of the gyro's angles, 15 bits
+_WR = const(31)  # 3: rounding remainders of the gyro's angles, 15 bits
 _B = const(34)  # 3: gyro bias that is set, angle per step
 _BR = const(37)  # 3: its last 15 bits, 0..32767
 _O = const(40)  # 3: what is added to the gyro: less the bias, set and learnt
@@ -46,26 +46,26 @@ class Euler6(Attitude):
 
         roll' = p + u tan(pitch)    pitch' = q cos(roll) - r sin(roll)    yaw' = u / cos(pitch)
 
-    and the accelerometer draws roll to atan2(ay, az), pitch to atan2(-ax, hypot(ay, az)): in each step by dt/tau of
-    the difference. Yaw is the integral of the gyro alone. The sines are those of half-way through the step, as the last
-    step's turn foresees it: second order, with one set of sines.
+    The accelerometer pulls roll to atan2(ay, az) and pitch to atan2(-ax, hypot(ay, az)), in each step by dt/tau of the
+    difference. Yaw is the integral of the gyro only. The sines are those of the middle of the step, predicted from the
+    last step: second order, with one set of sines.
 
     rate              samples per second: int, or (num, den) for num/den Hz
     gyro_scale        (num, den): exact LSB per deg/s
     accel_lsb_per_g   int, 64..32767; below 1/16 g the accelerometer is not used
-    tau               time constant in s of the way from gyro to accelerometer; None: the gyro alone. It is held to 1e-4
-                      of its value, or less well where it is very long. A gyro bias b leaves a tilt of b tau.
+    tau               time constant of the accelerometer's correction in s; None: the gyro only. It is exact to 1e-4 of
+                      its value, or less if it is very long. A gyro bias b leaves a tilt of b tau.
 
     The tutorials' `angle = a (angle + gyro dt) + (1 - a) accel` with a = 0.98 at 100 Hz is tau = dt / (1 - a) = 0.5 s,
-    which believes every push. On eight recorded trials with the bias taken off, the mean error (yaw aligned) is 33 deg
-    at 0.5 s, 13 at 2 s, 5.7 at 8 s and 3.5 at 32 s. Beyond the default, 8 s, little is gained, a bias of 0.1 deg/s that
-    is left tilts by more than a degree, and a wrong start lasts minutes. 1 or 2 s suit slow motion and an unknown bias.
+    which takes every push for a tilt. On eight recorded trials with the bias taken off, the mean error (yaw aligned) is
+    33 deg at 0.5 s, 13 at 2 s, 5.7 at 8 s and 3.5 at 32 s. Beyond the default, 8 s, little is gained: a remaining bias
+    of 0.1 deg/s tilts by more than a degree, and a wrong start lasts minutes. 1 or 2 s suit slow motion and an unknown
+    bias.
 
-    At pitch = +-90 deg roll and yaw are one and the same turn, and their rates have no bound. Here 1/cos(pitch) ends
+    At pitch = +-90 deg roll and yaw turn about the same axis, and their rates have no bound. Here 1/cos(pitch) ends
     at 32 and yaw turns by a quarter a step at most; beyond the pole the angles go on as roll + 180, 180 - pitch,
-    yaw + 180. Nothing overflows, and roll and pitch come back within a few tau of having passed close by; yaw may be
-    wrong by any angle from then on, as nothing corrects it. Where attitudes near the pole matter, take a quaternion
-    filter.
+    yaw + 180. Nothing overflows, and roll and pitch recover within a few tau. Yaw may be wrong by any angle afterwards,
+    because nothing corrects it. For attitudes near the pole use a quaternion filter.
 
     Raises ValueError for a rate, scale or tau that the numbers cannot hold, with the range that they can. At 2000 deg/s
     full scale 42 Hz to 90 kHz hold, at 250 deg/s 6 Hz to 11 kHz.
@@ -82,7 +82,8 @@ class Euler6(Attitude):
             self._set_tau(tau)
 
     def prepare(self, rate, gyro_scale, accel_lsb_per_g, words, bias_limit_dps=0):
-        """All but the gains. Room is left for a bias that is learnt, up to the limit -> that in 2**-45 turn a step."""
+        """Set up all but the gains, with room for a learnt bias up to the limit. Returns that limit in 2**-45 turn a
+        step."""
         limit = fixmath.quantise(bias_limit_dps, "bias_limit_dps")
         if limit > 250000000:
             raise ValueError("bias_limit_dps is %r, expected 0..250 deg/s" % (bias_limit_dps,))
@@ -137,8 +138,8 @@ class Euler6(Attitude):
     def seed(self, counts):
         """Take roll and pitch from one accelerometer sample, yaw 0; any attitude will do.
 
-        Returns True, or False when the sample is shorter than 1/16 g: then all angles are 0. The bias stays. update()
-        is to be given the same sample next.
+        Returns True, or False when the sample is shorter than 1/16 g: then all angles are 0. The bias stays. Give
+        update() the same sample next.
         """
         sample = array("h", [counts[0], counts[1], counts[2], 0, 0, 0, 0, 0, 0, 0, 1])
         if not accel_angles(self.state, sample):
@@ -176,8 +177,8 @@ class Euler6(Attitude):
     def set_bias(self, x, y, z, known_s=0):
         """Set the gyro's bias, ints in 1/256 of a gyro count; it is subtracted from every sample.
 
-        known_s, how well the bias is known, changes nothing here. Raises ValueError beyond +-8192 counts, and for a
-        known_s that is none.
+        known_s, how well the bias is known, changes nothing here. Raises ValueError beyond +-8192 counts, and for an
+        invalid known_s.
         """
         bias = bias_of(x, y, z, known_s)
         s = self.state

@@ -3,8 +3,8 @@
 # the viper emitter. The kernels allocate nothing, raise nothing, use no float, and give the same bits on every port.
 #
 # The kernels work on a filter's state, one array('i') that starts as fixmath.py's (probe, quaternion, half angle;
-# `turn` needs no more). A block is 2**BLOCK steps of 22 to 44 ms together (up to 80 ms below 90 Hz): what is slow
-# runs once a block, each part on a step of its own, so its constants do not depend on the sample rate. Bounds:
+# `turn` needs no more). A block is 2**BLOCK steps of 22 to 44 ms together (up to 80 ms below 90 Hz): slow parts
+# run once a block, each on a step of its own, so their constants do not depend on the sample rate. Bounds:
 # docs/numerics.md.
 
 from array import array
@@ -18,8 +18,8 @@ from upright.attitude import Attitude, bias_of, hertz
 # -- words of the state: written by tools/upright_host/words.py
 _PROBE = const(0)  # always -1, see fixmath.py
 _Q = const(1)  # 4, Q29: quaternion w x y z, body to earth
-_QR = const(5)  # 4, Q44: what rounding has left of it, 0..32767
-_WR = const(12)  # 3, Q46: what rounding has left of it, 0..32767
+_QR = const(5)  # 4, Q44: its rounding remainder, 0..32767
+_WR = const(12)  # 3, Q46: its rounding remainder, 0..32767
 _G = const(15)  # Q31: half angle per step of one gyro count
 _GR = const(16)  # Q46: its last bits, 0..32767
 _O = const(17)  # 3, Q31: minus the bias as a half angle per step
@@ -71,8 +71,8 @@ _ATAN = array("i", [
 def to_earth(s: ptr32, counts: ptr16):
     """R of Q; FORCE, the specific force in the earth frame; a fresh magnetometer sample goes into the sum MS, MN.
 
-    The accelerometer is taken as measured: neither normalised nor left out at full scale, so that what comes in swings
-    cancels. A magnetometer sample is left out when all of it is zero or an axis is at full scale.
+    The accelerometer is used as measured, neither normalised nor left out at full scale, so that swings cancel. A
+    magnetometer sample is left out when all of it is zero or an axis is at full scale.
     """
     k = 0
     if s[_PROBE] > 0:
@@ -241,18 +241,18 @@ def low_pass(s: ptr32, gyro: int):
 
 # ----------------------------------------------------------------------------- set-up and main loop: allocates
 class EarthFilter(Attitude):
-    """What both filters are set up and asked by. A filter below it has besides:
+    """Set-up and readings of both filters. A subclass adds:
 
     PARAMETERS             {name: (default, least, most)}, in s, rad, g, deg/s ...; taken to six significant digits
-    start_at(q, known)     see Attitude; known: 1 tilt, 2 tilt and heading are those of a sample, 0: nothing is known
-    bounds(p)              the largest bias that is learnt, in 1e-6 deg/s, and what of 1 rad (Q31) corrections take
+    start_at(q, known)     see Attitude; known: 1 the tilt, 2 tilt and heading are from a sample, 0: neither
+    bounds(p)              the largest learnt bias in 1e-6 deg/s, and the part of 1 rad (Q31) that corrections use
     set_up(p, given)       the filter's own words; p: parameters in millionths; given: those that were given, as given
-    bias_is_new(known_s)   a bias was set: forget what was learnt of it
+    bias_is_new(known_s)   a bias was set: drop the learnt one
     bias_unit              (num, den): gyro counts of one unit of B
     """
 
     def __init__(self, rate, gyro_scale, accel_lsb_per_g, words, parameters):
-        """Take rate, scales and parameters, or raise; then set_up(p, parameters), start level and know no bias.
+        """Check rate, scales and parameters, or raise; then call set_up(p, parameters), start level and without a bias.
 
         p: all parameters in millionths.
         """
@@ -325,8 +325,8 @@ class EarthFilter(Attitude):
         """Take roll and pitch from one accelerometer sample, heading from the magnetometer's where flags bit 1 is set.
 
         Without a magnetometer sample yaw is 0 (order zyx). Returns True, or False when the accelerometer is shorter
-        than 1/16 g: then the attitude is the identity. What has been learnt of bias and field stays. update() is to be
-        given the same sample next.
+        than 1/16 g: then the attitude is the identity. The learnt bias and field stay. Give update() the same
+        sample next.
         """
         x, y, z = counts[0], counts[1], counts[2]
         if (x * x + y * y + z * z) << 8 < self.accel_lsb_per_g**2:
@@ -352,11 +352,11 @@ class EarthFilter(Attitude):
         s[_MN] = s[_SINCE] = s[_J] = 0
 
     def set_bias(self, x, y, z, known_s=0):
-        """Set the gyro's bias, ints in 1/256 of a gyro count; what the filter learns from now on comes on top of it.
+        """Set the gyro's bias, ints in 1/256 of a gyro count; what the filter learns afterwards is added to it.
 
-        known_s: how well it is known, as the seconds of rest over which it was averaged: 0..3600; 0: not at all.
+        known_s: how well it is known: the seconds of rest over which it was averaged, 0..3600; 0: unknown.
 
-        Raises ValueError beyond +-8192 counts, and for a known_s that is none.
+        Raises ValueError beyond +-8192 counts, and for an invalid known_s.
         """
         bias = bias_of(x, y, z, known_s)
         s = self.state
@@ -391,7 +391,7 @@ class EarthFilter(Attitude):
 
     @property
     def resting(self):
-        """True while the body is taken to be at rest: then the bias is what the gyro reads."""
+        """True while the filter finds the body at rest: then the gyro's reading is its bias."""
         return self.state[_STILL] == self.state[_REST_AFTER]
 
 

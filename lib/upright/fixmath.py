@@ -17,9 +17,9 @@ from micropython import const
 # -- words of the state: written by tools/upright_host/words.py
 _PROBE = const(0)  # always -1: ptr32 zero-extends on 64-bit ports, see fixmath.py
 _Q = const(1)  # 4, Q29: quaternion w x y z, body to earth
-_QR = const(5)  # 4, Q44: what rounding has left of it, 0..32767
+_QR = const(5)  # 4, Q44: its rounding remainder, 0..32767
 _W = const(9)  # 3, Q31: half the angle of this step, rad
-_WR = const(12)  # 3, Q46: what rounding has left of it, 0..32767
+_WR = const(12)  # 3, Q46: its rounding remainder, 0..32767
 # -- end of the words
 
 ONE = const(1 << 29)  # 1.0 in Q29

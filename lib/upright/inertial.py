@@ -1,7 +1,7 @@
-# The inertial-frame Mahony filter in 32-bit integers: sensor counts in, quaternion out, with its own gyro bias and its
-# own judgement of the magnetic field. Needs fixmath.py, earth_kernels.py, inertial_kernels.py and the
-# viper emitter. update() is made for a hard interrupt: it allocates nothing, raises nothing, uses no float, and gives
-# the same bits on every port.
+# The inertial-frame Mahony filter in 32-bit integers: sensor counts in, quaternion out, which estimates the gyro bias
+# and rejects a disturbed magnetic field. Needs fixmath.py, earth_kernels.py, inertial_kernels.py and the viper emitter.
+# update() is made for a hard interrupt: it allocates nothing, raises nothing, uses no float, and gives the same bits on
+# every port.
 
 import micropython
 from micropython import const
@@ -112,9 +112,9 @@ class Inertial9(EarthFilter):
 
     After R. Mahony, T. Hamel, J.-M. Pflimlin, IEEE TAC 53(5), 2008, with the acceleration low-passed in the earth
     frame (an idea of VQF: D. Laidig, T. Seel, Information Fusion 91, 2023), so that swings and shakes cancel before
-    they count as tilt. The gyro bias is estimated at rest and in motion, with a gain that falls as knowledge grows. The
-    magnetometer turns the heading alone, by a bounded rate, and only while the field looks like the usual one. Raw
-    counts will do: no calibration before, one set of parameters.
+    they count as tilt. The gyro bias is estimated at rest and in motion, with a gain that falls as it becomes known.
+    The magnetometer turns only the heading, at a bounded rate, and only while the field is like its reference. Raw
+    counts are enough: no calibration before, one set of parameters.
 
     rate              samples per second: int, or (num, den) for num/den Hz
     gyro_scale        (num, den): exact LSB per deg/s
@@ -122,8 +122,8 @@ class Inertial9(EarthFilter):
 
     parameters        by name, see PARAMETERS; taken to six significant digits
 
-    A steady rotation from power-on on looks like a bias and is taken for one, up to bias_limit_dps. The first 1.5 s at
-    rest settle it.
+    A steady rotation from power-on looks like a bias and is taken for one, up to bias_limit_dps, until the first 1.5 s
+    at rest.
 
     Raises ValueError for a rate, scale or parameter that the numbers cannot hold, with the range that they can:
     82 to 1439 Hz at +-2000 deg/s, from 50 Hz on at +-1000 deg/s and less.
@@ -261,22 +261,22 @@ class Inertial9(EarthFilter):
 
     @property
     def mag_accepted(self):
-        """True while the magnetometer turns the heading; False when its field is rejected, or there is none."""
+        """True while the magnetometer corrects the heading; False if its field is rejected or absent."""
         s = self.state
         return s[_WEIGHT] == 2 and s[_SINCE] < 16 and s[_HN] > 0
 
     @property
     def heading_uncertainty_mdeg(self):
-        """How far the heading may be off, in millidegrees, roughly: 0..180000.
+        """Approximate error of the heading in millidegrees: 0..180000.
 
-        The average distance from the magnetometer's heading while that is accepted; otherwise it grows with what is not
-        known of the vertical axis's bias. Six axes: since the start.
+        It is the average difference from the magnetometer's heading while that is accepted. Otherwise it grows with the
+        uncertainty of the vertical axis's bias. Six axes: since the start.
         """
         return (self.state[_DOUBT] >> 15) * 7162 >> 10
 
     @property
     def tilt_confidence(self):
-        """How much the accelerometer tells of the vertical, in 1/1000: 1000 at rest, less the harder the shaking."""
+        """How well the accelerometer shows the vertical, in 1/1000: 1000 at rest, less with harder shaking."""
         return self.state[_OM] * 125 >> 12
 
     # -- tick
@@ -284,9 +284,9 @@ class Inertial9(EarthFilter):
     def update(self, counts):
         """One step of 1/rate with the sample counts: array('h') of 11 words.
 
-        Where flags (word 10) has bit 0 clear (no fresh sample) the last gyro words go on, without feedback, and the
-        clock of all that is estimated stands still. Bit 1: the magnetometer's words are fresh; any rate down to a tenth
-        of the steps' will do. Bits 2 and 3 (full scale) change nothing: to leave such samples out would be worse.
+        With bit 0 of flags (word 10) clear (no fresh sample) the filter turns with the last gyro words, without
+        feedback, and all estimates stay unchanged. Bit 1: the magnetometer's words are fresh; its rate may be as low as
+        a tenth of the steps'. Bits 2 and 3 (full scale) change nothing: leaving such samples out would be worse.
         """
         state = self.state
         s = ptr32(state)
@@ -339,7 +339,7 @@ class Inertial9(EarthFilter):
                 s[_GAP] += 1
         else:
             if s[_GAP]:
-                if s[_GAP] == s[_OUTAGE]:  # too long to know where it has turned
+                if s[_GAP] == s[_OUTAGE]:  # too long: the attitude is unknown
                     s[_N] = 0
                     s[_HN] = 0
                 s[_GAP] = 0
@@ -350,7 +350,7 @@ class Inertial9(EarthFilter):
             i = s[_PHASE]
             s[_PHASE] = (i + 1) & s[_BLOCK_MASK]
             if i == 0:
-                # what the rest detector is given: sample and block mean, less the bias that was set
+                # input of the rest detector: sample and block mean, less the bias that was set
                 fine = 12 - s[_BLOCK]
                 i = 0
                 while i < 3:
@@ -382,7 +382,7 @@ class Inertial9(EarthFilter):
 
 
 class Inertial9Lite(Inertial9):
-    """Inertial9 that takes every magnetic field as it is, and never starts its heading anew."""
+    """Inertial9 that accepts every magnetic field, and never restarts its heading."""
 
     NAME = "inertial9-lite"
     LITE = True

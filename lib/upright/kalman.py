@@ -1,5 +1,5 @@
-# Kalman filters with steady gains in 32-bit integers: one for any angle or number, and one for attitude that learns the
-# gyro's bias. Needs attitude.py, fixmath.py, complementary.py and the viper emitter. update() is made
+# Kalman filters with steady gains in 32-bit integers: one for any angle or number, and one for the attitude, which
+# learns the gyro's bias. Needs attitude.py, fixmath.py, complementary.py and the viper emitter. update() is made
 # for a hard interrupt: it allocates nothing, raises nothing, uses no float, and gives the same bits on every port.
 
 from array import array
@@ -17,7 +17,7 @@ _GAIN_REST = const(2)  # ... and its next 20 bits
 _RATIO = const(3)  # Q/R, Q(29 - SHIFT) ...
 _RATIO_REST = const(4)  # ... and its next 20 bits
 _SHIFT = const(5)  # 2 + Q/R <= 2**SHIFT, 1..20
-_SETTLED = const(6)  # 1: K is what it will always be
+_SETTLED = const(6)  # 1: K has settled
 _VALUE = const(7)  # the estimate ...
 _VALUE_REST = const(8)  # ... and its next 29 bits
 _TURN = const(9)  # units a turn, 0: does not wrap
@@ -51,13 +51,13 @@ ONE = 1 << 100  # set-up computes gains with 100 bits behind the point
 
 
 class KalmanFilter:
-    """The scalar Kalman filter: a level that wanders, measured with noise. Integers in, integers out.
+    """The scalar Kalman filter: a value that changes at random, measured with noise. Integers in, integers out.
 
     x     the first measurement, an int within +-2**29
-    Q     variance of the wandering per step, in the unit's square; 0: x is a constant, and this is the running mean
-    R     variance of a measurement, in the same unit; only Q/R counts, and 0 or 1e-10..1e6 is held
-    turn  units in a turn, for an angle: innovation and estimate wrap. The default is for millidegrees. 2..2**30, or
-          None (or 0) for what does not wrap
+    Q     variance of the change per step, in the unit's square; 0: x is a constant, and this is the running mean
+    R     variance of a measurement, in the same unit; only Q/R matters: 0 or 1e-10..1e6
+    turn  for an angle: units in a turn, 2..2**30; innovation and estimate wrap. The default is for millidegrees. None
+          (or 0): no wrap
 
     With x known, P = R to begin with, and per measurement the five equations of the textbooks
 
@@ -65,13 +65,14 @@ class KalmanFilter:
 
     P' / (P' + R) = K and (1 - K) P' = R P' / (P' + R) give P = K R; so with q = Q/R the gain has a recursion of its
     own, K <- (K + q) / (K + q + 1), and x + K (z - x) is all that is left. It settles at K = (sqrt(q**2 + 4 q) - q) / 2
-    and then costs nothing more. With the much-copied Q = 10 and R = 0.05 that is K = 0.995, from the first step on: the
-    estimate is 99.5 % of the newest measurement, and one sees no effect. Q = 0.001, R = 1 (K = 0.031) averages over 32.
+    and is not computed any more. With the much-copied Q = 10 and R = 0.05 that is K = 0.995, from the first step on:
+    the estimate is 99.5 % of the newest measurement, so it has no visible effect. Q = 0.001, R = 1 (K = 0.031) averages
+    over 32.
 
-    One object a signal. The C function that is passed around keeps x and P in static variables: called for pitch, roll
-    and yaw in turn, each of them is filtered into the next.
+    Use one object a signal. A widely copied C function keeps x and P in static variables: called for pitch, roll and
+    yaw in turn, it filters each of them into the next.
 
-    Raises TypeError for what is not a number, ValueError for what is out of range, with the range.
+    Raises TypeError for an argument that is not a number, ValueError with the range for one out of range.
 
     gain  K as an int, Q29;  K, P: floats, for hosts;  Q, R: as they were given
     """
@@ -154,8 +155,8 @@ class KalmanFilter:
 def settle_gain(s: ptr32):
     """One step of the scalar filter's gain: K = d / (1 + d) with d = K + Q/R, by long division, 49 bits.
 
-    With K = 1e-5 a step changes it by 1e-10 of itself at most, so it takes these bits to arrive. Once it has not
-    changed it never will.
+    With K = 1e-5 a step changes it by 1e-10 of itself at most, so it needs these bits to converge. Once it does
+    not change, it stays constant.
     """
     shift = s[_SHIFT]
     h = s[_GAIN]
@@ -193,16 +194,16 @@ def settle_gain(s: ptr32):
 class Kalman6(Euler6):
     """Euler6 with a two-state Kalman filter per axis, angle and gyro bias: yaw by integration.
 
-    Everything that is said of Euler6 holds, tau aside: the gains are those at which the filter below settles, and
-    set-up computes them. A step is then Euler6's, and a second gain for the bias.
+    All of Euler6 holds but tau. The gains are those at which the filter below settles; set-up computes them. A step is
+    Euler6's, with a second gain for the bias.
 
     The model, for roll and pitch each: angle += (gyro - bias) dt + noise of variance q_angle dt, bias += noise of
     variance q_bias dt, and the accelerometer's angle has noise of variance r_angle.
 
-    q_angle         deg**2 / s, what the gyro adds to the angle's variance
-    q_bias          (deg/s)**2 / s, what the bias wanders by; 0: no bias is learnt
-    r_angle         deg**2, of a single sample, so the gains depend on the rate, and motion belongs to it:
-                    0.1 g of it is 6 deg
+    q_angle         deg**2 / s, the gyro's share of the angle's variance
+    q_bias          (deg/s)**2 / s, random walk of the bias; 0: no bias is learnt
+    r_angle         deg**2, of a single sample, so the gains depend on the rate; it includes motion: 0.1 g
+                    is 6 deg
     bias_limit_dps  each axis of the bias that is learnt stays within +- this, deg/s, 0..250
 
     At a high rate, with n = r_angle dt, the gains come to c = sqrt(q_bias / n), 1/s**2, for the bias and to
@@ -214,7 +215,7 @@ class Kalman6(Euler6):
     What is learnt is the bias of the body's axes, not that of the angles' rates, so it stays right when the body turns.
     The errors of roll and pitch are taken as a turn about two horizontal axes, the forward one (times cos(pitch)) and
     the left one; the gyro is corrected by that, as the body sees it. Each angle's error and its bias then follow the
-    model above at any attitude; the vertical part of the bias, which the accelerometer knows nothing of, is left alone.
+    model above at any attitude; the vertical part of the bias, which the accelerometer does not show, is not changed.
 
     Raises ValueError like Euler6, and for variances whose gains the numbers cannot hold.
     """
@@ -270,7 +271,7 @@ class Kalman6(Euler6):
         s[_K2_SHIFT] = bias_pair[1] - 14
 
     def set_bias(self, x, y, z, known_s=0):
-        """Euler6.set_bias; what is learnt from now on comes on top of it."""
+        """Euler6.set_bias; what is learnt afterwards is added to it."""
         Euler6.set_bias(self, x, y, z, known_s)
         for i in range(3):
             self.state[_I + i] = self.state[_IR + i] = 0

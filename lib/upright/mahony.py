@@ -14,9 +14,9 @@ from upright.mahony_kernels import MAG_LOW, STEPS_MAX, north, tilt
 # -- words of the state: written by tools/upright_host/words.py
 _PROBE = const(0)  # always -1: ptr32 zero-extends on 64-bit ports, see fixmath.py
 _Q = const(1)  # 4, Q29: quaternion w x y z, body to earth
-_QR = const(5)  # 4, Q44: what rounding has left of it, 0..32767
+_QR = const(5)  # 4, Q44: its rounding remainder, 0..32767
 _W = const(9)  # 3, Q31: half the angle of this step, rad
-_WR = const(12)  # 3, Q46: what rounding has left of it, 0..32767
+_WR = const(12)  # 3, Q46: its rounding remainder, 0..32767
 _E = const(22)  # 3, Q29: the attitude error as a rotation vector in the body; see north
 _LOW = const(25)  # least squared length / 4 of the accelerometer's counts that is used, 4..2**28
 _I = const(26)  # 3: integral of the feedback, half angle per step, Q(31 + I_SHIFT)
@@ -59,8 +59,8 @@ class Mahony6(Attitude):
     ki                integral gain, rad/s**2 per unit; 0 switches the integral off
     bias_limit_dps    each axis of the integral stays within +- this, deg/s, 0..250
 
-    kp, ki and bias_limit_dps are taken to six significant digits, and kp and ki then held to 1e-4
-    of their value, or less well where they are very small.
+    kp, ki and bias_limit_dps are rounded to six significant digits. kp and ki are exact to 1e-4 of their value, or less
+    if they are very small.
 
     The widespread C code with Kp, Ki and halfT: Kp = kp and halfT = dt / 2 = 1 / (2 * rate). Where
     it has `exInt += ex * Ki`, without the time, its Ki = ki * dt; where it has `ex * Ki * halfT`,
@@ -92,7 +92,7 @@ class Mahony6(Attitude):
         """Take roll and pitch from one accelerometer sample, yaw 0 (order zyx); any attitude will do.
 
         Returns True, or False when the sample is shorter than 1/16 g: then the attitude is the
-        identity. The bias and the integral stay. update() is to be given the same sample next.
+        identity. The bias and the integral stay. Give update() the same sample next.
         """
         x, y, z = counts[0], counts[1], counts[2]
         if (x * x >> 2) + (y * y >> 2) + (z * z >> 2) < self.state[_LOW]:
@@ -113,7 +113,7 @@ class Mahony6(Attitude):
 
         The integral of the feedback is kept apart from it (it is added to the rate) and starts
         again from 0; known_s, how well the bias is known, changes nothing here. Raises ValueError
-        beyond +-8192 counts, and for a known_s that is none.
+        beyond +-8192 counts, and for an invalid known_s.
         """
         bias = bias_of(x, y, z, known_s)
         s = self.state
@@ -128,7 +128,7 @@ class Mahony6(Attitude):
             s[_OR + i] = -s[_BR + i]
 
     def bias_mdps(self, out):
-        """What the filter takes for the gyro's bias, in millidegrees/s: the bias set less the integral.
+        """The filter's gyro bias in millidegrees/s: the bias set less the integral.
 
         out: array('i') of 3 words. For the main loop: it may allocate.
         """
@@ -163,8 +163,8 @@ class Mahony6(Attitude):
         """
         state = self.state
         tilt(state, counts)  # E
-        # W = (gyro - bias + kp E + integral) dt/2, after the integral has taken up E. This stands here and not in
-        # a kernel of its own: to call one costs as much as to do a third of its work.
+        # W = (gyro - bias + kp E + integral) dt/2, after the integral has taken up E. This is not a
+        # kernel of its own: a call costs as much as a third of its work.
         s = ptr32(state)
         c = ptr16(counts)
         down = 0  # how much coarser than Q29 E is
@@ -244,7 +244,7 @@ class Mahony9(Mahony6):
     rate, gyro_scale, accel_lsb_per_g, bias_limit_dps: as for Mahony6. kp and ki act on the sum of
     both errors, accel x up and mag x the field that the attitude makes of it (mahony_kernels.north). A
     heading error falls with the time constant 1 / (kp (1 - sin(dip))) in s: a steep field turns the
-    attitude rather about the horizontal, which the accelerometer undoes.
+    attitude mostly about the horizontal, and the accelerometer undoes that.
 
     A magnetometer sample is used when flags (word 10) has bits 0 and 1 set, no word of it is at
     full scale of int16 and it is 16 counts or longer; at all other times this is Mahony6, bit for
@@ -266,8 +266,8 @@ class Mahony9(Mahony6):
     def seed(self, counts):
         """Mahony6.seed, with the heading from the magnetometer when flags (word 10) has bit 1 set.
 
-        It is 0 all the same where update() would not use the sample, or the field is within 1.8 deg
-        of the vertical: see `heading_seeded`. Returns True, or False when the accelerometer sample
+        The heading is 0 if update() would not use the sample, or if the field is within 1.8 deg of the vertical: see
+        `heading_seeded`. Returns True, or False when the accelerometer sample
         is shorter than 1/16 g: then the attitude is the identity.
         """
         self.heading_seeded = False

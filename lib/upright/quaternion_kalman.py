@@ -1,5 +1,5 @@
 # The multiplicative quaternion Kalman filter in 32-bit integers: sensor counts in, quaternion out, with the gyro's bias
-# and with variances that say how well all of it is known. Needs fixmath.py, earth_kernels.py,
+# and the variances of both. Needs fixmath.py, earth_kernels.py,
 # quaternion_kernels.py and the viper emitter. update() is made for a hard interrupt: it allocates nothing, raises
 # nothing, uses no float, and gives the same bits on every port.
 
@@ -205,17 +205,17 @@ class QuaternionKalman9(EarthFilter):
     Spacecraft Attitude Estimation, JGCD 5(5), 1982). The error is that in the earth frame (right-invariant: A. Barrau,
     S. Bonnabel, IEEE TAC 62(4), 2017), where gravity and north stand still, so that the measurements are constant.
 
-    An accelerometer measures motion as well as gravity. What is known of the motion is that velocities stay small: so
-    the specific force is turned into the earth frame and integrated, and what is measured is that the horizontal
-    velocity is 0, within velocity_noise. Swings and shakes cancel; a tilt error makes the velocity run away.
+    An accelerometer measures motion as well as gravity. Velocities stay small, so the specific force is turned into
+    the earth frame and integrated, and the measurement is a horizontal velocity of 0, within velocity_noise. Swings
+    and shakes cancel; a tilt error makes the velocity grow.
 
-    The magnetometer measures the heading alone, and corrects nothing but heading and bias (Schmidt's form): a magnet
-    cannot tilt. Its noise grows with the distance of the field (horizontal and vertical part) from a slowly tracked
+    The magnetometer measures the heading, and corrects only heading and bias (Schmidt's form): a magnet cannot tilt
+    the attitude. Its noise grows with the distance of the field (horizontal and vertical part) from a slowly tracked
     reference, and beyond field_tolerance it is left out. At rest the averaged gyro measures the bias. Innovations are
-    bounded by 5 sigma; when that lasts, the variance is opened up, so that a wrong start is forgotten. Raw counts will
-    do, one set of parameters.
+    bounded by 5 sigma. If that lasts, the variance is increased, so a wrong start is forgotten. Raw counts are enough,
+    with one set of parameters.
 
-    The covariance is propagated once a block of 22 to 44 ms, and the work for it spread over the steps of the next.
+    The covariance is propagated once a block of 22 to 44 ms. The work is spread over the steps of the next block.
 
     rate              samples per second: int, or (num, den) for num/den Hz
     gyro_scale        (num, den): exact LSB per deg/s
@@ -223,9 +223,8 @@ class QuaternionKalman9(EarthFilter):
 
     parameters        by name, see PARAMETERS; taken to six significant digits
 
-    Limits: a push that lasts (0.3 g for 5 s) is taken for a tilt; a kick that the gyro has not seen is forgotten at
-    once at rest, but only within 15 s in motion; a steady rotation from power-on on looks like a bias and is taken for
-    one.
+    Limits: a long push (0.3 g for 5 s) is taken for a tilt. A turn that the gyro has not measured is corrected at once
+    at rest, but takes up to 15 s in motion. A steady rotation from power-on looks like a bias and is taken for one.
 
     Raises ValueError for a rate, scale or parameter that the numbers cannot hold, with the range that they can:
     60 to 1439 Hz at +-2000 deg/s, from 50 Hz on at +-1000 deg/s and less.
@@ -346,7 +345,7 @@ class QuaternionKalman9(EarthFilter):
         for i in (_WIDE_FOR, _LOST, _FAR):
             s[i] = 0
         s[_YOUNG] = s[_AFTER]
-        s[_STAGE] = 8  # the block that was being worked on is of the old attitude
+        s[_STAGE] = 8  # the block in work belongs to the old attitude
         s[_PHASE] = 1
         tilt = _SEEDED if known else _OPEN
         self._open(0, tilt)
@@ -373,7 +372,7 @@ class QuaternionKalman9(EarthFilter):
 
     @property
     def mag_accepted(self):
-        """True while the magnetometer measures the heading; False when its field is rejected, or there is none."""
+        """True while the magnetometer measures the heading; False if its field is rejected or absent."""
         s = self.state
         return s[_GOOD] > 0 and s[_SINCE] < 16 and s[_WIDE_FOR] == 0
 
@@ -395,9 +394,9 @@ class QuaternionKalman9(EarthFilter):
     def update(self, counts):
         """One step of 1/rate with the sample counts: array('h') of 11 words.
 
-        Where flags (word 10) has bit 0 clear (no fresh sample) the last gyro words go on, without feedback, and the
-        clock of all that is estimated stands still. Bit 1: the magnetometer's words are fresh; any rate down to a tenth
-        of the steps' will do. Bits 2 and 3 (full scale) change nothing: to leave such samples out would be worse.
+        With bit 0 of flags (word 10) clear (no fresh sample) the filter turns with the last gyro words, without
+        feedback, and all estimates stay unchanged. Bit 1: the magnetometer's words are fresh; its rate may be as low as
+        a tenth of the steps'. Bits 2 and 3 (full scale) change nothing: leaving such samples out would be worse.
         """
         state = self.state
         s = ptr32(state)

@@ -34,12 +34,14 @@ class Wrong(ValueError):
 
 
 class Unavailable(Exception):
-    """A runtime, a tool or a package cannot be had here; the message is one line that says why."""
+    """A runtime, a tool or a package is not available here; the message is one line that says why."""
 
     runtime: str | None = None  # which, if it is one
 
     def line(self) -> str:
-        return f"runtime {self.runtime} cannot be had here: {self}" if self.runtime else str(self)
+        return (
+            f"runtime {self.runtime} is not available here: {self}" if self.runtime else str(self)
+        )
 
 
 class Commands(typer.core.TyperGroup):

@@ -14,7 +14,7 @@ SUITE = "trixie"  # Debian 13
 
 
 class AptError(Exception):
-    """A package cannot be had here; the message is one line that says why."""
+    """A package is not available here; the message is one line that says why."""
 
 
 class Apt:

@@ -93,7 +93,7 @@ def register(app: typer.Typer):
     ):
         """Examine a board: self-test, chips, rates, timer, heap, axis maps; and what to fix."""
         if axes and (simulated or emulated):
-            raise Wrong("nobody turns a simulated board: --axes needs a real one")
+            raise Wrong("a simulated board cannot be turned: --axes needs a real one")
         if simulated:
             problems = examine_simulated(simulated, simulate.best_runtime(), say)
         else:

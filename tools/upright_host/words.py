@@ -18,9 +18,9 @@ END = "# -- end of the words\n"
 MAHONY = """
 PROBE        1  -    always -1: ptr32 zero-extends on 64-bit ports, see fixmath.py
 Q            4  Q29  quaternion w x y z, body to earth
-QR           4  Q44  what rounding has left of it, 0..32767
+QR           4  Q44  its rounding remainder, 0..32767
 W            3  Q31  half the angle of this step, rad
-WR           3  Q46  what rounding has left of it, 0..32767
+WR           3  Q46  its rounding remainder, 0..32767
 V            3  -    a measured vector, scaled so that its length is 2**15..2**16
 VR           1  Q30  1 / that length, 16384..32768
 UP           3  Q28  the estimated up (gravity's reaction) in the body
@@ -60,7 +60,7 @@ K            1  -    the part of the error that is taken up: K / 2**(K_SHIFT + 1
 K_SHIFT      1  -    0..16
 G            1  -    angle per step of one gyro count
 GR           1  -    its last 15 bits, 0..32767
-WR           3  -    what rounding left of the gyro's angles, 15 bits
+WR           3  -    rounding remainders of the gyro's angles, 15 bits
 B            3  -    gyro bias that is set, angle per step
 BR           3  -    its last 15 bits, 0..32767
 O            3  -    what is added to the gyro: less the bias, set and learnt
@@ -82,9 +82,9 @@ I_MAX        1  -    bound of |I|, below 2**30
 EARTH = """
 PROBE        1  -    always -1, see fixmath.py
 Q            4  Q29  quaternion w x y z, body to earth
-QR           4  Q44  what rounding has left of it, 0..32767
+QR           4  Q44  its rounding remainder, 0..32767
 W            3  Q31  half the angle of this step, rad
-WR           3  Q46  what rounding has left of it, 0..32767
+WR           3  Q46  its rounding remainder, 0..32767
 G            1  Q31  half angle per step of one gyro count
 GR           1  Q46  its last bits, 0..32767
 O            3  Q31  minus the bias as a half angle per step
@@ -221,7 +221,7 @@ UE           1  -    ... its measured value, in X's units ...
 UR           1  -    ... its variance / 16, in P's units ...
 UM           1  -    ... bits of the errors that it must not correct
 OVER         1  -    1: it was beyond 2.5 sigma
-MEANT        2  -    tilt from the accelerometer as it is, X's units
+MEANT        2  -    tilt from the accelerometer as measured, X's units
 HG           1  -    HS to H: HG / 2**HG_SHIFT
 HG_SHIFT     1  -
 C            1  -    C - 15; the bias is in units of 2**-C rad a block, B 10 bits finer
@@ -237,7 +237,7 @@ BS           1  -    first variance of the bias
 RV           1  -    variances / 16: velocity ...
 RM           1  -    ... heading from one block ...
 RR           1  -    ... bias at rest ...
-RA           1  -    ... accelerometer believed as it is
+RA           1  -    ... accelerometer used as measured
 V0           1  -    first variance of the velocity
 AXIS         1  -    of the bias that is measured at rest
 Z            3  -    low-passed gyro in B's units
@@ -245,7 +245,7 @@ REST_OFF     1  -    most that a known bias may be off, B's units
 KNOWN        1  -    variance of a known bias
 CB           1  -    counts (Q12) to B's units: CB / 2**CB_SHIFT
 CB_SHIFT     1  -
-WIDE_FOR     1  -    blocks with the accelerometer believed as it is; then 2, 1, 0
+WIDE_FOR     1  -    blocks with the accelerometer used as measured; then 2, 1, 0
 WIDE_MOST    1  -
 LOST         1  -    blocks with the velocity beyond 2.5 sigma
 LOST_MOST    1  -
@@ -265,7 +265,7 @@ FAR_MOST     1  -    blocks
 GOOD         1  -    1: the field is that of the reference; 2: there is no reference yet
 FIRST        1  -    blocks after which there is one
 NOISE        1  -    variance / 16 of the heading
-YOUNG        1  -    blocks until motion tells of the bias
+YOUNG        1  -    blocks until motion shows the bias
 AFTER        1  -    the same at the start
 """
 
