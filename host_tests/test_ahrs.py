@@ -488,13 +488,22 @@ def test_every_wrong_setting_is_named_at_once_and_before_anything_moves():
         drive="telepathy",
         euler="xyz",
         accel_range_g=3,
-        dlpf=2,
+        dlpf="narrow",
         display_chunk=7,
+        sensor_rate_hz=(100, 1),
+        fifo_hz=100000,
+        keep_bias=3,
+        gains=5,
+        dmp_image=5,
         log=None,
     )
     with pytest.raises(ValueError) as why:
         imu.start()
-    for name in ("RATE is 0", "DRIVE is", "EULER is", "ACCEL_RANGE_G is 3", "DISPLAY_CHUNK is 7"):
+    for name in (
+        *("RATE is 0", "DRIVE is", "EULER is", "ACCEL_RANGE_G is 3", "DISPLAY_CHUNK is 7"),
+        *("DLPF is 'narrow'", "SENSOR_RATE_HZ is (100, 1)", "FIFO_HZ is 100000", "KEEP_BIAS is 3"),
+        *("GAINS is 5", "DMP_IMAGE is 5", "unknown filter 'magic'"),
+    ):
         assert name in str(why.value)
     assert transfers(0) == 0 == machine.I2C(0)._bus.bytes
 
@@ -502,6 +511,29 @@ def test_every_wrong_setting_is_named_at_once_and_before_anything_moves():
 def test_an_option_that_is_none_is_refused():
     with pytest.raises(ValueError, match="no setting RATEE"):
         upright.AHRS(MPU6050(bus()), ratee=100)
+    with pytest.raises(TypeError, match="on_step is a function"):
+        upright.AHRS(MPU6050(bus()), on_step=5)
+
+
+def test_an_array_too_short_is_refused_and_nothing_written_behind_it():
+    imu, _ = start()
+    for call in (imu.angles_into, imu.rates_into):
+        with pytest.raises(ValueError, match="3 words"):
+            call(array("i", [0, 0]))
+
+
+def test_without_a_display_there_is_nothing_to_refresh():
+    imu, _ = start()
+    assert imu.refresh_display() is False
+
+
+def test_the_temperature_of_a_reading_is_that_of_its_step():
+    imu, _ = start()
+    reading = imu.reading()
+    before = reading.temperature()
+    imu.sensor.counts[9] += 340
+    assert reading.temperature() == before == imu.temperature()
+    assert imu.sensor.temperature() == pytest.approx(before + 1)
 
 
 def test_where_timers_are_soft_the_fifo_is_drained(monkeypatch):

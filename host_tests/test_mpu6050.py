@@ -267,6 +267,15 @@ def test_a_program_gets_g_and_degrees_per_second_and_celsius():
     assert imu.temperature() == pytest.approx(35, abs=0.01)
 
 
+def test_after_configure_a_program_gets_a_sample_and_before_it_a_reason():
+    _, imu = running((4096, -2048, 1024, 164, -82, 41, 0, 0, 0, -521))
+    assert imu.accel() == (1.0, -0.5, 0.25)
+    assert not imu.counts[10] & 1  # it is no fresh one for a tick
+    for reading in (driver().accel, driver().gyro):
+        with pytest.raises(MPU6050Error, match="configure"):
+            reading()
+
+
 # with
 
 

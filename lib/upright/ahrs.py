@@ -38,23 +38,23 @@ def stop():
         ahrs.stop()
 
 
-def from_board(board, **settings):
-    """An AHRS of the sensors and settings of a board's module (boards/README.md), not started.
+def from_board(module, **settings):
+    """An AHRS of the sensors and settings of a board's module (docs/new-board.md), not started.
 
     settings: those of AHRS; they replace the board's.
     """
     options = {
-        "magnetometer": getattr(board, "magnetometer", None),
-        "timer": board.make_tick,
-        "display": board.display,
-        "data_ready": getattr(board, "data_ready_pin", None),
-        "board": board.NAME,
+        "magnetometer": getattr(module, "magnetometer", None),
+        "timer": module.make_tick,
+        "display": module.display,
+        "data_ready": getattr(module, "data_ready_pin", None),
+        "board": module.NAME,
     }
-    found = of_board(board)
+    found = of_board(module)
     for name in found:
         options[name.lower()] = found[name]
     options.update(settings)
-    return AHRS(board.sensor(), **options)
+    return AHRS(module.sensor(), **options)
 
 
 class AHRS:
@@ -103,6 +103,8 @@ class AHRS:
     ):
         if not hasattr(sensor, "configure"):
             raise TypeError("the sensor is a driver, as in AHRS(MPU6050(i2c)), not %r" % (sensor,))
+        if on_step is not None and not callable(on_step):
+            raise TypeError("on_step is a function that takes the AHRS, not %r" % (on_step,))
         given = {"RATE": rate, "FILTER": filter, "DRIVE": drive, "CALIBRATION": calibration}
         for name in settings:
             given[name.upper()] = settings[name]
@@ -586,9 +588,11 @@ class AHRS:
 
     def refresh_display(self):
         """Send a chunk to a display on its own bus, from the main loop as often as possible. Returns whether more is
-        left."""
+        left; False without a display."""
         self._attend()
         display = self.display
+        if display is None:
+            return False
         if display.busy and not self.settings.DISPLAY_SHARES_BUS:
             display.flush_step(self.settings.DISPLAY_CHUNK)
         return display.busy

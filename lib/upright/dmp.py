@@ -474,7 +474,10 @@ class MpuDmp(Attitude, Counters):
     gyro = Mpu.gyro
     temperature = Mpu.temperature
 
-    def temperature_cdeg(self):
+    def _need_configured(self):
+        pass  # the scales are the image's
+
+    def temperature_cdeg(self, counts=None):
         """The temperature at the time of configure() in hundredths of a degC."""
         return self._imu.temperature_cdeg()
 

@@ -169,10 +169,12 @@ class Mpu(Counters):
         self.monitor.no_sample(raw)
         return False
 
-    def temperature_cdeg(self):
-        """Temperature of the newest sample in hundredths of a degC, by the formula of the part."""
+    def temperature_cdeg(self, counts=None):
+        """Temperature in hundredths of a degC, by the formula of the part; counts: None: of the newest sample."""
         mul, div, offset = self._temperature
-        return (self.counts[9] * mul + (div >> 1)) // div + offset
+        if counts is None:
+            counts = self.counts[9]
+        return (counts * mul + (div >> 1)) // div + offset
 
     def bus_fault(self):
         """Count a bus fault that another part of the driver has met, and have health() check the chip."""
@@ -181,12 +183,14 @@ class Mpu(Counters):
     # For programs: these allocate
 
     def accel(self):
-        """(x, y, z) of the newest sample in g, in the chip's frame."""
+        """(x, y, z) of the newest sample in g, in the chip's frame: of the last read(), or of configure()."""
+        self._need_configured()
         counts, lsb = self.counts, self.accel_lsb_per_g
         return counts[0] / lsb, counts[1] / lsb, counts[2] / lsb
 
     def gyro(self):
-        """(x, y, z) of the newest sample in deg/s, in the chip's frame."""
+        """The same of the gyro in deg/s."""
+        self._need_configured()
         counts, (num, den) = self.counts, self.gyro_scale
         return counts[3] * den / num, counts[4] * den / num, counts[5] * den / num
 
@@ -526,8 +530,11 @@ class Mpu(Counters):
 
     def _settle(self):
         time.sleep_ms(self.settle_ms)
-        # drops a sample that was ready meanwhile
+        # a sample that was ready meanwhile: accel() has it until there is a newer one
+        raw = self._raw
         self.registers.read_registers(_INT_STATUS, self._burst)
+        if unpack(raw, _HEAD, self.counts):
+            self.monitor.not_fresh()
         self.monitor.heard()
 
     def _need_configured(self):

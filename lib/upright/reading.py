@@ -102,4 +102,4 @@ class Reading:
 
     def temperature(self):
         """Temperature of the sensor chip in degC."""
-        return self._ahrs.sensor.temperature_cdeg() / 100
+        return self._ahrs.sensor.temperature_cdeg(self._words[ticks.TEMPERATURE]) / 100

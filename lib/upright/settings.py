@@ -103,16 +103,16 @@ class Settings:
         self._demand(wrong, "RATE", good_rate, "Hz as a positive int, or (num, den) for num/den Hz")
         drives = self.DRIVE is None or self.DRIVE in DRIVES
         self._demand(wrong, "DRIVE", drives, ", ".join(['"%s"' % name for name in DRIVES]))
-        for name in ("FIFO_HZ", "MAG_RATE_HZ"):
-            self._demand(wrong, name, is_int(getattr(self, name), 1), "Hz as a positive int")
-        sampled = self.SENSOR_RATE_HZ
-        if sampled is not None:
-            good = is_int(sampled, 1) or isinstance(sampled, tuple)
-            self._demand(wrong, "SENSOR_RATE_HZ", good, "Hz as a positive int, or None")
+        self._demand(wrong, "FIFO_HZ", is_int(self.FIFO_HZ, 1, 1000), "Hz as an int, 1..1000")
+        self._demand(wrong, "MAG_RATE_HZ", is_int(self.MAG_RATE_HZ, 1), "Hz as a positive int")
+        good = self.SENSOR_RATE_HZ is None or is_int(self.SENSOR_RATE_HZ, 1)
+        self._demand(wrong, "SENSOR_RATE_HZ", good, "Hz as a positive int, or None")
         self._demand(wrong, "ACCEL_RANGE_G", self.ACCEL_RANGE_G in _ACCEL_RANGES, "2, 4, 8 or 16")
         self._demand(
             wrong, "GYRO_RANGE_DPS", self.GYRO_RANGE_DPS in _GYRO_SCALES, "250, 500, 1000 or 2000"
         )
+        good = self.DLPF in (None, "bypass") or is_int(self.DLPF, 0, 7)
+        self._demand(wrong, "DLPF", good, "0..7; mpu.py has the bandwidths")
         self._demand(wrong, "EULER", self.EULER in ("zyx", "zxy"), '"zyx" or "zxy"')
         chunk = self.DISPLAY_CHUNK
         good = is_int(chunk, 8, 128) and chunk % 8 == 0
@@ -121,6 +121,17 @@ class Settings:
         self._demand(wrong, "DECLINATION", _is_number(self.DECLINATION, -180, 180), "degrees")
         good = self.CALIBRATION is None or isinstance(self.CALIBRATION, str)
         self._demand(wrong, "CALIBRATION", good, "the name of a file, or None")
+        image = self.DMP_IMAGE
+        good = isinstance(image, (str, bytes, bytearray)) or hasattr(image, "seek")
+        self._demand(wrong, "DMP_IMAGE", good, "the name of a file")
+        self._demand(wrong, "GAINS", isinstance(self.GAINS, dict), "a dict")
+        for name in ("EXTERNAL_CLOCK", "MEASURE_BIAS", "KEEP_BIAS", "DISPLAY_SHARES_BUS"):
+            value = getattr(self, name)
+            self._demand(wrong, name, value is True or value is False, "True or False")
+        try:
+            filters.check(self.filter_name(axes))
+        except ValueError as why:
+            wrong.append(str(why))
         try:
             calibration.Calibration(self.IMU_AXES, self.MAG_AXES)
         except (ValueError, TypeError) as why:
@@ -145,7 +156,6 @@ class Settings:
                 )
         name = self.filter_name(axes)
         try:
-            filters.check(name)
             if name not in filters.HARDWARE:
                 filters.make(name, self.RATE, _Scales(self), self.GAINS)
             elif num % den or drive not in (None, "timer"):

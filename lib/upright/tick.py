@@ -405,6 +405,8 @@ class Tick:
 
         See fixmath.euler for the order.
         """
+        if len(out) < 3:  # a kernel writes where it is told to
+            raise ValueError("angles and rates take 3 words")
         n = _TRIES
         while n > 0:
             sequence = self._state[_SEQUENCE]
@@ -418,6 +420,8 @@ class Tick:
     def rates_into(self, out):
         """Angular rates of the newest step about body x, y, z, without the filter's bias, in millidegrees per second,
         into out[0..2]. Returns as snapshot() does."""
+        if len(out) < 3:
+            raise ValueError("angles and rates take 3 words")
         n = _TRIES
         while n > 0:
             sequence = self._state[_SEQUENCE]
