@@ -31,7 +31,7 @@ _MOST_Z = const(8250)
 _MAG_FRESH = const(2)
 _COUNT_MASK = const(0x3FFFFFFF)
 
-# Words of the state and _STEP's _WATCH, as in magnetometer.py
+# -- words of the state: written by tools/upright_host/words.py
 _FRESH = const(0)
 _STALE = const(1)
 _SATURATED = const(2)
@@ -42,9 +42,8 @@ _LIMIT = const(6)
 _N = const(7)
 _WAS_READY = const(8)
 _X = const(9)
-_Y = const(10)
-_Z = const(11)
-_WATCH = const(4)
+# -- end of the words
+_WATCH = const(4)  # STEP, as in magnetometer.py
 
 
 class IST8310Error(OSError):
@@ -155,7 +154,7 @@ class IST8310(Magnetometer):
         counts[7] = y
         counts[8] = z
         state[_X] = x
-        state[_Y] = y
-        state[_Z] = z
+        state[_X + 1] = y
+        state[_X + 2] = z
         state[_FRESH] = (state[_FRESH] + 1) & _COUNT_MASK
         return _MAG_FRESH

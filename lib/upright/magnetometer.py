@@ -16,22 +16,23 @@ _COUNT_MASK = const(0x3FFFFFFF)
 _BUSY = const(-1)  # what transact() returns, as in auxiliary_bus.py
 _NACK = const(-2)
 
-# Words of the state. The subclass's take() keeps those from _FRESH to _Z.
-_FRESH = const(0)
-_STALE = const(1)
-_SATURATED = const(2)
-_UNFLAGGED = const(3)
-_STEP = const(4)
+# The subclass's take() keeps the words from FRESH to X.
+# -- words of the state: written by tools/upright_host/words.py
+_FRESH = const(0)  # measurements that were delivered
+_STALE = const(1)  # times that a measurement was overdue
+_SATURATED = const(2)  # measurements that were withheld, an axis being beyond its range
+_UNFLAGGED = const(3)  # measurements that were recognised by their data
+_STEP = const(4)  # what the look at a register is for
 _LEFT = const(5)  # samples until the next measurement is overdue
-_LIMIT = const(6)
+_LIMIT = const(6)  # LEFT after a measurement
 _N = const(7)  # samples from one measurement to the next
-_WAS_READY = const(8)  # the status of the sample before was ready
-_X = const(9)  # the newest measurement
-# and those of read():
-_DUE = const(12)  # calls after which a measurement may be ready; 0 behind an IMU
-_AGE = const(13)  # calls since the last one was started
+_WAS_READY = const(8)  # the status said so with the sample before
+_X = const(9)  # 3: the newest measurement
+_DUE = const(12)  # calls of read() after which a measurement may be through; 0 behind an IMU
+_AGE = const(13)  # calls of read() since the last one was started
 _WAITING = const(14)  # 1: it has not come yet
 _WORDS = const(15)
+# -- end of the words
 
 # _STEP: what the next access to a register is for. Measurements are delivered in _WATCH only.
 _ABSENT = const(0)  # does it answer?

@@ -1,4 +1,5 @@
-"""The words of each filter's state: one table, from which the constants in the filters' modules are written.
+"""The words of each filter's state, and of a magnetometer's: one table, from which the constants in the modules are
+written.
 
 A kernel finds a word of the state by a constant of its own module, as MicroPython folds no others. Run this after a
 change of a table: `python -m upright_host.words` writes the constants that each module uses, `--check` only compares.
@@ -287,6 +288,23 @@ class Word:
         return f"_{self.name} = const({self.at})" + (f"  # {text}" if text else "")
 
 
+MAGNETOMETER = """
+FRESH        1  -    measurements that were delivered
+STALE        1  -    times that a measurement was overdue
+SATURATED    1  -    measurements that were withheld, an axis being beyond its range
+UNFLAGGED    1  -    measurements that were recognised by their data
+STEP         1  -    what the look at a register is for
+LEFT         1  -    samples until the next measurement is overdue
+LIMIT        1  -    LEFT after a measurement
+N            1  -    samples from one measurement to the next
+WAS_READY    1  -    the status said so with the sample before
+X            3  -    the newest measurement
+DUE          1  -    calls of read() after which a measurement may be through; 0 behind an IMU
+AGE          1  -    calls of read() since the last one was started
+WAITING      1  -    1: it has not come yet
+"""
+
+
 def table(*parts: str) -> dict[str, Word]:
     """{name: word} of the tables one after the other."""
     words, at = {}, 0
@@ -311,6 +329,7 @@ STATES = {
     "kalman": table(EULER, KALMAN),
     "inertial": table(EARTH, INERTIAL),
     "quaternion_kalman": table(EARTH, QUATERNION_KALMAN),
+    "magnetometer": table(MAGNETOMETER),
 }
 
 # module: (its state, does its list say what the words are)
@@ -327,6 +346,8 @@ MODULES = {
     "inertial": ("inertial", False),
     "quaternion_kernels": ("quaternion_kalman", True),
     "quaternion_kalman": ("quaternion_kalman", False),
+    "magnetometer": ("magnetometer", True),
+    "ist8310": ("magnetometer", False),
 }
 
 
