@@ -348,7 +348,7 @@ def test_any_changed_register_is_found_within_one_round(row):
     chip.poke(register, value ^ 0x20)
     states = [imu.health() for _ in range(len(imu.configuration()))]
     assert states.count(HEALTH_MISMATCH) == 1
-    for _ in range(imu.repair_calls):
+    for _ in range(imu.monitor.repair_calls()):
         imu.health()
     assert chip.register(register) == value
     assert imu.health() == HEALTH_OK and imu.resets == 1
@@ -387,7 +387,7 @@ def test_a_brown_out_is_repaired_in_the_promised_calls_and_no_wrong_sample_is_fr
 
     calls, seen = survive(chip, imu, deliver)
     assert imu.resets == 1
-    assert calls <= imu.repair_calls
+    assert calls <= imu.monitor.repair_calls()
     assert seen and all(counts == good for counts in seen)  # neither another scale nor start-up
     assert not any(register == PWR_MGMT_1 and value & 0x80 for _, register, value in log)
     assert [(register, chip.register(register)) for register, _ in imu.configuration()] == (

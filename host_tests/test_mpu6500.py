@@ -441,7 +441,7 @@ def test_a_changed_register_of_others_is_found_and_put_right():
     chip.poke(0x25, 0x0C)
     states = [imu.health() for _ in range(len(imu.configuration()))]
     assert states.count(HEALTH_MISMATCH) == 1
-    for _ in range(imu.repair_calls):
+    for _ in range(imu.monitor.repair_calls()):
         imu.health()
     assert chip.register(0x25) == 0x8E and imu.resets == 1
 
@@ -458,19 +458,19 @@ def test_bits_that_the_mask_leaves_out_are_nobodys_business():
 def test_set_rows_changes_a_row_in_place_and_puts_a_new_one_before_user_ctrl():
     chip, imu = running()
     before = imu.configuration()
-    calls = imu.repair_calls
+    calls = imu.monitor.repair_calls()
     imu.set_rows([(0x67, 0x81, 0xFF), (0x19, 1, 0xFF)])
     after = imu.configuration()
     assert after == [(0x19, 1) if row[0] == 0x19 else row for row in before[:-1]] + [
         (0x67, 0x81),
         before[-1],
     ]
-    assert imu.repair_calls == calls + 2
+    assert imu.monitor.repair_calls() == calls + 2
     assert chip.register(0x67) == 0x81
     imu.set_rows([(0x67, 0x82, 0xFF)])
     assert len(imu.configuration()) == len(after) and chip.register(0x67) == 0x82
     imu.configure()
-    assert imu.configuration() == before and imu.repair_calls == calls
+    assert imu.configuration() == before and imu.monitor.repair_calls() == calls
 
 
 def test_a_row_that_does_not_hold_is_reported_by_its_name():

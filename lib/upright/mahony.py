@@ -81,7 +81,7 @@ class Mahony6(Attitude):
         self.bias_set = [0, 0, 0]  # 1/256 counts
         self.heading_seeded = False
         s = self.state
-        s[_Q] = fixmath.ONE
+        self.start_at((fixmath.ONE, 0, 0, 0))
         s[_LOW] = accel_lsb_per_g * accel_lsb_per_g >> 10  # (1/16 g)**2 / 4
         s[_MAG_AGE] = _NEVER
         references = self.AXES // 3 - 1
@@ -312,7 +312,7 @@ def _set_gains(s, rate, gyro_scale, kp, ki, bias_limit_dps, error_max=1):
         raise ValueError("bias_limit_dps is %r, expected 0..250 deg/s" % (bias_limit_dps,))
     limit_q31 = fixmath.ratio(half_num * limit << 31, half_den * 1000000)
 
-    least = _times_root3((gain * (32768 + 8192) >> 15) + limit_q31)  # Q31 of a rad
+    least = ((gain * (32768 + 8192) >> 15) + limit_q31) * 17321 // 10000  # Q31 of a rad, root 3
     if least > _W_MAX or gain < 1 << 17:
         raise ValueError(
             "rate is %s, expected %d..%d Hz at %d/%d LSB per deg/s and a bias limit of %r deg/s: "
@@ -377,18 +377,10 @@ def _set_gains(s, rate, gyro_scale, kp, ki, bias_limit_dps, error_max=1):
             unit = 1 << (s[_KP_SHIFT] + 14)  # 2 kp dt = KP / unit
             steps = min(steps, unit // s[_KP], (_W_MAX - least) * unit // (s[_KP] << 29) - 1)
         s[_MAG_MOST] = max(steps, 1)
-    for i in range(4):
-        s[_QR + i] = 16384
-    for i in range(3):
-        s[_WR + i] = 16384
 
 
 def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _times_root3(v):
-    return v * 17321 // 10000
 
 
 def _millionths(v):

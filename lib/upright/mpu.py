@@ -448,11 +448,6 @@ class Mpu(Counters):
         if on:
             self.fifo_enable(min(fifo.batch, fifo.size // fifo.packet))
 
-    @property
-    def repair_calls(self):
-        """The most calls of health() that a repair takes, from the first stale sample on, if the bus works."""
-        return self.monitor.repair_calls()
-
     # Its parts
 
     def _hand_on_to(self, device):

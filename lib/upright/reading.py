@@ -33,8 +33,7 @@ class Reading:
 
     def angles(self, order=None):
         """(roll, pitch, yaw) in degrees; yaw within +-180, positive to the left; order "zyx", "zxy"; None: EULER."""
-        mdeg = array("i", [0] * 3)
-        fixmath.euler(self._words, mdeg, order or self._ahrs.settings.EULER)
+        mdeg = self._mdeg(order or self._ahrs.settings.EULER)
         yaw = (mdeg[2] - self._zero[0] + 180000) % 360000 - 180000
         return mdeg[0] / 1000, mdeg[1] / 1000, yaw / 1000
 
@@ -80,9 +79,7 @@ class Reading:
         ahrs = self._ahrs
         if ahrs.filter.AXES < 9 or ahrs.magnetometer is None:
             return None
-        mdeg = array("i", [0] * 3)
-        fixmath.euler(self._words, mdeg, ahrs.settings.EULER)
-        return (ahrs.settings.DECLINATION - mdeg[2] / 1000) % 360
+        return (ahrs.settings.DECLINATION - self._mdeg(ahrs.settings.EULER)[2] / 1000) % 360
 
     def turns(self):
         """The yaw with its full turns since the start or zero_yaw(), in turns to the left."""
@@ -90,15 +87,19 @@ class Reading:
 
     def unwrapped_mdeg(self):
         """The yaw in millidegrees with all its full turns, before zero_yaw()."""
-        mdeg = array("i", [0] * 3)
-        fixmath.euler(self._words, mdeg, "zyx")
-        whole = mdeg[2] + 360000 * self._words[ticks.TURNS]
+        whole = self._mdeg("zyx")[2] + 360000 * self._words[ticks.TURNS]
         order = self._ahrs.settings.EULER
         if order == "zyx":
             return whole
         # full turns are counted for the yaw of zyx; the yaw of the other order is within half a turn of it
+        yaw = self._mdeg(order)[2]
+        return yaw + 360000 * ((whole - yaw + 180000) // 360000)
+
+    def _mdeg(self, order):
+        """Roll, pitch, yaw in millidegrees, before zero_yaw()."""
+        mdeg = array("i", [0] * 3)
         fixmath.euler(self._words, mdeg, order)
-        return mdeg[2] + 360000 * ((whole - mdeg[2] + 180000) // 360000)
+        return mdeg
 
     def temperature(self):
         """Temperature of the sensor chip in degC."""
