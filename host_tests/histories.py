@@ -64,6 +64,15 @@ def of_twin(kind, twin, rendered, mag_every=1, bias=(), gains=None, **options):
     return q
 
 
+def follow(twin, rows, decided):
+    """A float twin over rows with the decisions of the integer run: its attitudes (n, 4)."""
+    q = np.empty((len(rows), 4))
+    for i, (row, bits) in enumerate(zip(rows, decided, strict=True)):
+        twin.update(row, bits)
+        q[i] = twin.q
+    return q
+
+
 def hold(what, q, twin, limit):
     """Never further than limit degrees apart; pytest -rP shows the figure."""
     worst = angles_between(q, twin).max()

@@ -25,8 +25,10 @@ class Rig:
         self.cls, self.chip, self.spi = cls, chip, spi
         self.error = MPU6050Error if cls is MPU6050 else MPU6500Error
 
-    def wired(self, counts=COUNTS, **options):
-        chip = self.chip(StillWorld(counts), **options)
+    def wired(self, world=COUNTS, **options):
+        """world: one, or the counts of one that stands still."""
+        world = world if isinstance(world, StillWorld) else StillWorld(world)
+        chip = self.chip(world, **options)
         if self.spi:
             machine.wire_spi(5, chip, cs=CS)
         else:
@@ -40,9 +42,9 @@ class Rig:
             options = {"address": 0x68} | options
         return self.cls(bus or self.bus(), **options)
 
-    def running(self, counts=COUNTS, rate=1000, configure=None, bus=None, **options):
+    def running(self, world=COUNTS, rate=1000, configure=None, bus=None, **options):
         """(chip, driver)."""
-        chip = self.wired(counts, **options)
+        chip = self.wired(world, **options)
         imu = self.driver(bus)
         imu.configure(sample_rate_hz=rate, **(configure or {}))
         return chip, imu

@@ -1,10 +1,8 @@
 """The auxiliary master of the MPU: transactions of SLV4, slots and their places, in set-up and in the tick."""
 
 import kernel
-import machine
 import pytest
-from chips.mpu6050 import MPU6050Chip
-from chips.mpu6500 import MPU6500Chip
+from imus import RIGS
 from upright.auxiliary_bus import (
     AUX_BUSY,
     AUX_NACK,
@@ -14,8 +12,6 @@ from upright.auxiliary_bus import (
     AuxiliaryNack,
     AuxiliaryTimeout,
 )
-from upright.mpu6050 import MPU6050
-from upright.mpu6500 import MPU6500, MPU6500_I2C
 from world import StillWorld
 
 USER_CTRL, MST_CTRL, DELAY_CTRL, SLV4_CTRL, SLV4_ADDR = 0x6A, 0x24, 0x67, 0x34, 0x31
@@ -57,30 +53,10 @@ class Device:
         pass
 
 
-def on_spi(world):
-    chip = MPU6500Chip(world)
-    machine.wire_spi(5, chip, cs="PF6")
-    cs = machine.Pin("PF6", machine.Pin.OUT, value=1)
-    return chip, MPU6500(machine.SPI(5, 1_000_000), cs)
-
-
-def on_i2c(world):
-    chip = MPU6050Chip(world)
-    machine.wire_i2c(0, chip)
-    return chip, MPU6050(machine.I2C(0, freq=400_000))
-
-
-def the_6500_on_i2c(world):
-    chip = MPU6500Chip(world)
-    machine.wire_i2c(0, chip)
-    return chip, MPU6500_I2C(machine.I2C(0, freq=400_000))
-
-
-@pytest.fixture(params=[on_spi, on_i2c, the_6500_on_i2c])
+@pytest.fixture(params=RIGS)
 def imu(request):
-    """A configured driver; .chip is its model."""
-    model, imu = request.param(StillWorld())
-    imu.configure(sample_rate_hz=1000)
+    """A configured driver; .model is that of its chip."""
+    model, imu = RIGS[request.param].running(StillWorld())
     imu.model = model
     return imu
 
@@ -184,7 +160,7 @@ def test_after_a_time_out_the_next_transaction_is_not_taken_for_the_old_one(imu,
     assert remote.read_register(0x06) == device.registers[0x06]
 
 
-@pytest.mark.parametrize("imu", [on_i2c, the_6500_on_i2c], indirect=True)  # SPI cannot tell
+@pytest.mark.parametrize("imu", ["MPU6050", "MPU6500_I2C"], indirect=True)  # SPI cannot tell
 def test_a_bus_that_fails_at_set_up_ends_in_good_time_and_is_blamed(imu, remote):
     imu.model.vanish()
     before = kernel.now()
@@ -363,7 +339,7 @@ def test_one_divider_is_shared_by_any_slots_that_ask_for_it(imu, aux):
 
 
 def test_slots_that_do_not_fit_into_a_sample_are_refused():
-    _, imu = on_i2c(StillWorld())
+    _, imu = RIGS["MPU6050"].running(StillWorld())
     imu.configure(sample_rate_hz=8000, dlpf=0)
     aux = AuxiliaryBus(imu)
     aux.begin()
@@ -417,7 +393,7 @@ def test_a_master_that_sleeps_is_given_up_and_nothing_comes_late(imu, remote, de
     assert carry_out(imu, remote, 0x11)[0] == device.registers[0x11]
 
 
-@pytest.mark.parametrize("imu", [on_i2c, the_6500_on_i2c], indirect=True)  # SPI cannot tell
+@pytest.mark.parametrize("imu", ["MPU6050", "MPU6500_I2C"], indirect=True)  # SPI cannot tell
 def test_a_bus_that_fails_in_the_tick_is_counted_and_tried_again(imu, remote, device):
     imu.model.vanish()
     for _ in range(3):

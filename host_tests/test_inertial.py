@@ -9,7 +9,7 @@ import numpy as np
 import overflow
 import pytest
 from conftest import recorded_trials
-from histories import ONE, SCALE, SCALES, angles_between, rows_of
+from histories import ONE, SCALE, SCALES, angles_between, follow, rows_of
 from reference import inertial_float
 from samples import counts, run
 from scenes import PACES, all_axes, errors, scene
@@ -49,11 +49,7 @@ def twin_history(rendered, decided, axes=9, lite=False, mag_every=1):
         num / den, scale, rendered.accel_lsb_per_g, axes=axes, lite=lite
     )
     twin.set_quaternion(inertial_float.start(rows[0], axes))
-    q = np.empty((len(rows), 4))
-    for i, (row, bits) in enumerate(zip(rows, decided, strict=True)):
-        twin.update(row, bits)
-        q[i] = twin.q
-    return q, twin
+    return follow(twin, rows, decided), twin
 
 
 # -- accuracy against the float twin; pytest -rP shows the figures

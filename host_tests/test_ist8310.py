@@ -7,12 +7,9 @@ import kernel
 import machine
 import pytest
 from chips.ist8310 import IST8310Chip
-from chips.mpu6050 import MPU6050Chip
-from chips.mpu6500 import MPU6500Chip
+from imus import RIGS
 from upright.auxiliary_bus import AuxiliaryBus
 from upright.ist8310 import IST8310, IST8310Error
-from upright.mpu6050 import MPU6050
-from upright.mpu6500 import MPU6500, MPU6500_I2C
 from upright.registers import I2CRegisters
 from world import StillWorld
 
@@ -36,20 +33,9 @@ class Rig:
 
     def __init__(self, kind, world=None, rate=1000):
         self.world = world or StillWorld((10, -20, 4096, 5, 6, -7, *FIELD, -521))
-        if kind == "spi":
-            self.chip = MPU6500Chip(self.world)
-            machine.wire_spi(5, self.chip, cs="PF6")
-            cs = machine.Pin("PF6", machine.Pin.OUT, value=1)
-            self.imu = MPU6500(machine.SPI(5, 1_000_000), cs)
-        else:
-            model, driver = MPU6050Chip, MPU6050
-            if kind == "6500 on i2c":
-                model, driver = MPU6500Chip, MPU6500_I2C
-            self.chip = model(self.world)
-            machine.wire_i2c(0, self.chip)
-            self.imu = driver(machine.I2C(0, freq=400_000))
+        rig = RIGS[{"spi": "MPU6500", "6500 on i2c": "MPU6500_I2C"}.get(kind, "MPU6050")]
+        self.chip, self.imu = rig.running(self.world, rate)
         self.mag_chip = IST8310Chip(self.world)
-        self.imu.configure(sample_rate_hz=rate)
         self.rate = rate
         self.period = 1_000_000 // rate
         if kind == "own bus":

@@ -7,13 +7,11 @@ from itertools import pairwise
 import kernel
 import machine
 import pytest
-from chips.mpu6050 import MPU6050Chip
-from chips.mpu6500 import MPU6500Chip
 from hostile import Hostile, plans
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from upright.mpu6050 import HEALTH_OK, MPU6050
-from upright.mpu6500 import MPU6500, MPU6500_I2C
+from imus import RIGS
+from upright.mpu6050 import HEALTH_OK
 from world import StillWorld
 
 WORDS = (0, 1, 2, 9, 3, 4, 5)  # places in a row of the words of a packet
@@ -42,10 +40,7 @@ def number(counts):
 
 def running(batch=8, **options):
     world = Numbered()
-    chip = MPU6050Chip(world, **options)
-    machine.wire_i2c(0, chip)
-    imu = MPU6050(machine.I2C(0, freq=400_000))
-    imu.configure(sample_rate_hz=1000)
+    chip, imu = RIGS["MPU6050"].running(world, **options)
     world.start(kernel.now())
     imu.fifo_enable(batch)
     return chip, imu
@@ -342,15 +337,8 @@ class Behind:
 def nine(length=7, batch=8, spi=True, fifo=True):
     """(chip, driver, ext): MPU6500 with a slave of `length` bytes read for every sample."""
     world = Numbered()
-    chip = MPU6500Chip(world)
+    chip, imu = RIGS["MPU6500" if spi else "MPU6500_I2C"].running(world)
     chip.aux.append(Slave())
-    if spi:
-        machine.wire_spi(5, chip, cs="PF6")
-        imu = MPU6500(machine.SPI(5), machine.Pin("PF6", machine.Pin.OUT, value=1))
-    else:
-        machine.wire_i2c(0, chip)
-        imu = MPU6500_I2C(machine.I2C(0, freq=400_000))
-    imu.configure(sample_rate_hz=1000)
     world.start(kernel.now())
     chip.world._numbered[9] = 0
     imu.set_rows([(0x24, 0x5D, 0xFF), (0x25, 0x8E, 0xFF), (0x26, 2, 0xFF)])

@@ -9,7 +9,7 @@ import numpy as np
 import overflow
 import pytest
 from conftest import recorded_trials
-from histories import ONE, SCALE, SCALES, angles_between, rows_of
+from histories import ONE, SCALE, SCALES, angles_between, follow, rows_of
 from reference import quaternion_kalman_float
 from reference.inertial_float import start
 from samples import counts, run
@@ -67,11 +67,7 @@ def twin_history(rendered, decided, axes=9, mag_every=1, first=None):
         twin.set_quaternion(start(rows[0], axes), True)
     else:
         twin.set_quaternion(first)
-    q = np.empty((len(rows), 4))
-    for i, (row, bits) in enumerate(zip(rows, decided, strict=True)):
-        twin.update(row, bits)
-        q[i] = twin.q
-    return q, twin
+    return follow(twin, rows, decided), twin
 
 
 # -- accuracy against the float twin; pytest -rP shows the figures
