@@ -69,7 +69,33 @@ def clamp(v, limit):
     return limit if v > limit else -limit if v < -limit else v
 
 
-class InertialFloat:
+class EarthFloat:
+    """What both float twins do that average in the earth frame."""
+
+    def chosen(self, defaults, parameters):
+        unknown = set(parameters) - set(defaults)
+        if unknown:
+            raise TypeError(f"no parameter {min(unknown)!r}")
+        return defaults | parameters
+
+    def decide(self, bit, value):
+        if self.forced is not None:
+            taken = bool(self.forced & bit)
+            self.disagreed += taken != bool(value)
+            value = taken
+        self.decided = self.decided | bit if value else self.decided & ~bit
+        return bool(value)
+
+    def gather(self, counts):
+        """A fresh magnetometer sample into its sum in the earth frame."""
+        m = counts[6:9]
+        if self.axes == 9 and counts[10] & 2 and any(m) and max(abs(v) for v in m) < 32767:
+            for i, row in enumerate(self.R):
+                self.mag_sum[i] += row[0] * m[0] + row[1] * m[1] + row[2] * m[2]
+            self.mag_n += 1
+
+
+class InertialFloat(EarthFloat):
     """The float twin of inertial.Inertial9, and by axes and lite of the others there.
 
     rate in Hz (float); gyro_scale LSB per deg/s and accel_lsb_per_g as floats; axes 6 or 9; lite: no field rejection
@@ -79,11 +105,7 @@ class InertialFloat:
     """
 
     def __init__(self, rate, gyro_scale, accel_lsb_per_g, axes=9, lite=False, **parameters):
-        p = dict(DEFAULTS)
-        for name, value in parameters.items():
-            if name not in p:
-                raise TypeError(f"no parameter {name!r}")
-            p[name] = value
+        p = self.chosen(DEFAULTS, parameters)
         self.p = p
         self.dt = 1 / rate
         self.block = block_of(rate)
@@ -162,12 +184,7 @@ class InertialFloat:
         self.C = [(R[0][i] * c0 + R[1][i] * c1) * dt for i in range(3)]
         for i in range(3):
             self.gyro_sum[i] += counts[3 + i]
-        if self.axes == 9 and counts[10] & 2:
-            m = counts[6:9]
-            if any(m) and not any(abs(v) >= 32767 for v in m):
-                for i in range(3):
-                    self.mag_sum[i] += R[i][0] * m[0] + R[i][1] * m[1] + R[i][2] * m[2]
-                self.mag_n += 1
+        self.gather(counts)
         if self.phase == 0:
             self._rest(counts)
         elif self.phase == 1:
@@ -182,14 +199,6 @@ class InertialFloat:
         if self.phase == (3 if self.block == 4 else 5):
             self._bias()
         self.phase = (self.phase + 1) % self.block
-
-    def decide(self, bit, value):
-        if self.forced is not None:
-            taken = bool(self.forced & bit)
-            self.disagreed += taken != bool(value)
-            value = taken
-        self.decided = self.decided | bit if value else self.decided & ~bit
-        return bool(value)
 
     # -- parts of a block
     def _rest(self, counts):

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from reference.inertial_float import block_of, clamp, rows, turned
+from reference.inertial_float import EarthFloat, block_of, clamp, rows, turned
 
 # decisions, as lib/upright/quaternion_kalman.py has them in its state
 STILL = 1  # gyro and accelerometer near their averages in this block
@@ -58,7 +58,7 @@ NOT_BY_MAG = np.array([1, 1, 0, 0, 0, 0, 1, 1], bool)
 BIAS = np.array([0, 0, 0, 1, 1, 1, 0, 0], bool)
 
 
-class QuaternionKalmanFloat:
+class QuaternionKalmanFloat(EarthFloat):
     """The float twin of quaternion_kalman.QuaternionKalman9, with 6 axes QuaternionKalman6.
 
     rate in Hz (float); gyro_scale LSB per deg/s and accel_lsb_per_g as floats; axes 6 or 9; any of DEFAULTS.
@@ -68,11 +68,7 @@ class QuaternionKalmanFloat:
     """
 
     def __init__(self, rate, gyro_scale, accel_lsb_per_g, axes=9, **parameters):
-        p = dict(DEFAULTS)
-        for name, value in parameters.items():
-            if name not in p:
-                raise TypeError(f"no parameter {name!r}")
-            p[name] = value
+        p = self.chosen(DEFAULTS, parameters)
         self.p, self.axes = p, axes
         self.block = block_of(rate)
         self.T = T = self.block / rate
@@ -138,14 +134,6 @@ class QuaternionKalmanFloat:
     def whole(self, seconds):
         return max(1, int(seconds / self.T + 0.5))
 
-    def decide(self, bit, value):
-        if self.forced is not None:
-            taken = bool(self.forced & bit)
-            self.disagreed += taken != bool(value)
-            value = taken
-        self.decided = self.decided | bit if value else self.decided & ~bit
-        return bool(value)
-
     # -- one step
     def update(self, counts, decisions=None):
         fresh = counts[10] & 1
@@ -167,12 +155,7 @@ class QuaternionKalmanFloat:
             self.block_sum[i] += R[i][0] * a[0] + R[i][1] * a[1] + R[i][2] * a[2]
             self.accel_sum[i] += a[i]
             self.gyro_sum[i] += counts[3 + i]
-        if self.axes == 9 and counts[10] & 2:
-            m = counts[6:9]
-            if any(m) and not any(abs(v) >= 32767 for v in m):
-                for i in range(3):
-                    self.mag_sum[i] += R[i][0] * m[0] + R[i][1] * m[1] + R[i][2] * m[2]
-                self.mag_n += 1
+        self.gather(counts)
         if self.phase == 0:
             self._close()
         elif self.phase == self.block - 1 and self.turn is not None:
