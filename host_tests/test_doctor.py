@@ -1,305 +1,205 @@
-"""The doctor: every wrong axis map is named and the right one proposed; a board's faults are told with what to do."""
+"""`upright doctor` and `upright record`: on a simulated board, and from the RAM of one."""
 
-import functools
-import itertools
-import json
-import math
-
-import motions
-import numpy as np
 import pytest
-from upright_app import axis_check
-from upright_host import runtimes
+from conftest import some_micropython
+from typer.testing import CliRunner
+from unix_board import UnixBoard
+from upright_host import cli, console, contents, device, doctor, paths, ram, record, recordings
 
+FACTS = device.Facts("rp2", "Pico", (1, 26, 1), 6, 3, "armv6m", True, False, True, True, 900000)
+
+
+BOARD = b"""
+PLATFORM = "linux"
+NAME = "a board"
 RATE = 100
-GYRO_BIAS_DPS = np.array(motions.DEFAULT_ERRORS.gyro_bias_dps)
-ALL_MAPS = [
-    [(index, sign) for index, sign in zip(order, signs, strict=True)]
-    for order in itertools.permutations(range(3))
-    for signs in itertools.product((1, -1), repeat=3)
-]
-RIGHT_HANDED = [axes for axes in ALL_MAPS if axis_check.handedness(axes) > 0]
-
-
-@functools.cache
-def tumble_counts(iron_uT=(40.0, -25.0, 60.0), name="hand", seconds=20):
-    """A board in a hand, in the body's frame, with hard iron; a field measured in every other row."""
-    errors = motions.Errors(mag_bias_uT=iron_uT)
-    counts = motions.render(name, RATE, seconds, errors=errors).counts.astype(int)
-    counts[:, 10] = np.where(np.arange(len(counts)) % 2, 3, 1)
-    return counts
-
-
-def as_chip(vectors, axes):
-    """What a chip delivers that sits on the board by this map (body from chip)."""
-    out = np.empty_like(vectors)
-    for body, (index, sign) in enumerate(axes):
-        out[:, index] = sign * vectors[:, body]
-    return out
-
-
-def judged(counts, imu_axes=("x", "y", "z"), south=False):
-    bias = as_chip((GYRO_BIAS_DPS * 16.4)[None], axis_check.parse(imu_axes))[0]
-    tumble = axis_check.Tumble((82, 5), 4096, imu_axes, bias)
-    for row in counts.tolist():
-        tumble.add(row, 1 / RATE)
-    return tumble.result(south)
-
-
-# ---------------------------------------------------------------- maps
-
-
-def test_the_maps_are_48_and_half_of_them_left_handed():
-    assert len({axis_check.names(axes) for axes in ALL_MAPS}) == 48
-    assert len(RIGHT_HANDED) == 24
-    for axes in ALL_MAPS:
-        assert axis_check.parse(axis_check.names(axes)) == axes
-        matrix = np.array(
-            [axis_check.mapped(unit, axes) for unit in np.eye(3, dtype=int).tolist()]
-        ).T
-        assert round(np.linalg.det(matrix)) == axis_check.handedness(axes)
-
-
-@pytest.mark.parametrize("axes", RIGHT_HANDED, ids=lambda axes: ",".join(axis_check.names(axes)))
-def test_three_postures_give_the_imus_map(axes):
-    up = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]]) * 4096  # level, nose up, left side up
-    seen = [axis_check.up_axis(row, 4096) for row in as_chip(up, axes).tolist()]
-    assert axis_check.imu_axes(*seen) == axis_check.names(axes)
-
-
-def test_postures_that_cannot_be_are_refused():
-    with pytest.raises(ValueError, match="opposite way up"):
-        axis_check.imu_axes((2, 1), (0, 1), (1, -1))  # right side up instead of left
-    with pytest.raises(ValueError, match="same axis"):
-        axis_check.imu_axes((2, 1), (0, 1), (0, -1))
-    assert axis_check.up_axis((2900, 0, 2900), 4096) is None
-
-
-# ---------------------------------------------------------------- the tumble
-
-
-@pytest.mark.parametrize("axes", ALL_MAPS, ids=lambda axes: ",".join(axis_check.names(axes)))
-def test_a_tumble_finds_the_magnetometers_map_among_all_48(axes):
-    counts = tumble_counts().copy()
-    counts[:, 6:9] = as_chip(counts[:, 6:9], axes)
-    verdict = judged(counts)
-    assert verdict.problem is None
-    assert verdict.axes == axis_check.names(axes)
-    assert verdict.score < 0.1 < 0.5 < verdict.second
-
-
-@pytest.mark.parametrize(
-    "imu", RIGHT_HANDED[::5], ids=lambda axes: ",".join(axis_check.names(axes))
-)
-def test_it_finds_it_on_a_board_whose_imu_is_turned_as_well(imu):
-    counts = tumble_counts().copy()
-    for at in (0, 3):
-        counts[:, at : at + 3] = as_chip(counts[:, at : at + 3], imu)
-    counts[:, 6:9] = as_chip(counts[:, 6:9], [(1, -1), (0, 1), (2, -1)])
-    assert judged(counts, axis_check.names(imu)).axes == ("-y", "x", "-z")
-
-
-@pytest.mark.parametrize("name, seconds", [("demo", 24), ("bursts", 20), ("hand", 15)])
-def test_other_tumbles_serve_too(name, seconds):
-    verdict = judged(tumble_counts(name=name, seconds=seconds))
-    assert verdict.axes == ("x", "y", "z")
-
-
-def test_iron_strength_and_dip_come_out_of_the_same_sums():
-    verdict = judged(tumble_counts())
-    assert np.allclose(np.array(verdict.offset) * 0.3, (40, -25, 60), atol=1)
-    assert abs(verdict.strength * 0.3 - motions.FIELD_UT) < 1
-    assert abs(verdict.dip_deg - motions.DIP_DEG) < 2
-
-
-def test_single_precision_as_on_boards_is_enough_even_beside_much_iron():
-    counts = tumble_counts((300.0, -200.0, 500.0)).astype(np.float32)
-    tumble = axis_check.Tumble((82, 5), 4096, ("x", "y", "z"))
-    for row, flags in zip(counts, counts[:, 10].astype(int), strict=True):
-        tumble.add([*row[:10], int(flags)], np.float32(1 / RATE))
-    verdict = tumble.result()
-    assert verdict.axes == ("x", "y", "z")
-    assert np.allclose(np.array(verdict.offset) * 0.3, (300, -200, 500), atol=3)
-
-
-def test_in_the_south_the_field_points_up():
-    counts = tumble_counts().copy()
-    counts[:, 6:9] *= -1  # the same place's opposite: a field up and south, turned by half
-    assert judged(counts).axes == ("-x", "-y", "-z")
-    assert judged(counts, south=True).axes == ("x", "y", "z")
-
-
-def test_near_the_magnetic_equator_it_says_that_the_sign_is_open(monkeypatch):
-    monkeypatch.setattr(motions, "DIP_DEG", 3.0)
-    counts = motions.render("hand", RATE, 30).counts.astype(int)
-    counts[:, 10] = 3
-    verdict = judged(counts)
-    assert verdict.axes in (("x", "y", "z"), ("-x", "-y", "-z"))
-    assert "or its opposite" in verdict.problem
-
-
-@pytest.mark.parametrize(
-    "spoil, why",
-    [
-        (lambda counts: motions.render("static", RATE, 30).counts, "too little turning"),
-        (lambda counts: motions.render("spin", RATE, 30).counts, "about one axis only"),
-        (lambda counts: noise(counts), "no map explains"),
-        (lambda counts: frozen(counts), "no map explains|one axis"),
-    ],
-    ids=["at rest", "about one axis", "noise for a field", "a field that stands still"],
-)
-def test_a_tumble_that_shows_nothing_is_refused(spoil, why):
-    counts = np.array(spoil(tumble_counts().copy()), int)
-    counts[:, 10] = 3
-    verdict = judged(counts)
-    assert verdict.axes is None
-    assert any(part in verdict.problem for part in why.split("|"))
-
-
-def noise(counts):
-    counts[:, 6:9] = np.random.default_rng(1).integers(-200, 200, (len(counts), 3))
-    return counts
-
-
-def frozen(counts):
-    counts[:, 6:9] = (60, 10, -140)
-    return counts
-
-
-def test_a_bias_of_the_gyro_that_was_not_taken_off_does_no_harm():
-    tumble = axis_check.Tumble((82, 5), 4096, ("x", "y", "z"))
-    for row in tumble_counts().tolist():
-        tumble.add(row, 1 / RATE)
-    assert tumble.result().axes == ("x", "y", "z")
-
-
-def test_the_quarter_turn_tells_a_gyro_and_a_field_that_disagree():
-    before, after = (
-        (60, 0, -150),
-        (0, -60, -150),
-    )  # the field turns to the right in a board that turns to the left
-    needle = axis_check.needle_turn(before, after, ("x", "y", "z"), (0, 0, 0))
-    assert math.isclose(needle, -90)
-    assert axis_check.judge_turn(90, needle) == []
-    assert "opposite" in axis_check.judge_turn(90, -needle)[0]
-    assert "to the right" in axis_check.judge_turn(-90, 90)[0]
-    assert "once more" in axis_check.judge_turn(40, -40)[0]
-
-
-# ---------------------------------------------------------------- on simulated boards
-
-# A board checked by hand: (body axis, deg, from s, lasts s); in between it lies still.
-NOSE_UP, LEFT_UP, TUMBLE, LEVEL, TURN = 4, 8, 12, 28, 33
-MOVES = [
-    (1, -90, NOSE_UP, 1),
-    (1, 90, LEFT_UP, 1),
-    (0, 90, LEFT_UP + 1, 1),
-    (0, -90, LEVEL - 1, 1),
-    (2, 90, TURN, 1.5),
-]
-
-
-def by_hand(rng):
-    def body_rate(t):
-        out = np.zeros((len(t), 3))
-        for axis, angle, at, lasts in MOVES:
-            u = (t - at) / lasts
-            rate = angle * np.pi / 2 / lasts * np.sin(np.pi * u)
-            out[:, axis] += np.where((u > 0) & (u < 1), rate, 0)
-        # to and fro about every axis, each turn taken back before the next
-        for k, axis in enumerate((0, 1, 2, 1, 0, 2, 0, 1)):
-            u = (t - TUMBLE - 1.8 * k) / 1.8
-            on = (u > 0) & (u < 1)
-            out[:, axis] += np.where(on, 260 * np.sin(2 * np.pi * u), 0)
-        return out
-
-    return body_rate, lambda t: np.zeros((len(t), 3))
-
-
-@pytest.fixture
-def checked_board(monkeypatch, tmp_path):
-    """checked_board(board, what, **options) -> console of doctor.<what> on the simulated board, moved by hand."""
-
-    def run(name, what, runtime=None, settings=(), still=False, **options):
-        monkeypatch.setitem(motions._MOTIONS, "by_hand", ((20, 0, 0), by_hand))
-        world = tmp_path / "hand.imu"
-        if not still:
-            motions.render("by_hand", 200, 44).write(world)
-        told = tmp_path / "told"
-        told.write_text(
-            json.dumps(
-                {"world": None if still else str(world), "name": name, "what": what}
-                | {"settings": dict(settings), "options": options}
-            )
-        )
-        script = tmp_path / "check.py"
-        script.write_text(SCRIPT)
-        runtime = runtime or "cpython"
-        done = runtimes.run(runtime, script, [told], board=name, timeout=300)
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout
-
-    return run
-
-
-SCRIPT = """
-import json, sys
-import boards, machine
-from world import StillWorld, World
-
-with open(sys.argv[1]) as file:
-    told = json.load(file)
-machine.power_on()
-world = World(told["world"]) if told["world"] else StillWorld()
-world.start(0)
-import board
-from upright_app import doctor
-parts = boards.wire(told["name"], board, world, told["options"])
-for name, value in told["settings"].items():
-    setattr(board, name, tuple(value) if isinstance(value, list) else value)
-if told["what"] == "report":
-    doctor.report(board)
-else:
-    doctor.axes(board, tumble_ms=12000)
+def sensor():
+    raise OSError("nobody at 0x68")
+def display(chunk):
+    return None
+def make_tick(rate, callback):
+    raise ValueError("no timer here")
+"""
+# A sensor that gives a sample whenever 10 ms have gone by
+SENSOR = b"""
+import time
+from array import array
+from upright import settings
+NAME = "a board"
+class Imu:
+    chip, sample_rate, accel_lsb_per_g, gyro_scale = "MPU6050", (100, 1), 4096, (82, 5)
+    errors = 0
+    def __init__(self):
+        self.counts = array("h", [0] * 11)
+        self.at = time.ticks_us()
+    def configure(self, *a, **k):
+        pass
+    def health(self):
+        pass
+    def read(self):
+        self.counts[10] = 0
+        if time.ticks_diff(time.ticks_us(), self.at) >= 10000:
+            self.at = time.ticks_us()
+            self.counts[2], self.counts[10] = 4096, 1
+        return self.counts[10]
+def sensor():
+    return Imu()
 """
 
 
-def test_the_guided_check_is_content_with_a_board_whose_maps_are_right(checked_board):
-    said = checked_board("robomaster_a", "axes")
-    assert "all is well" in said, said
-    for step in "12345":
-        assert f"{step}. " in said
+@pytest.fixture
+def unix(tmp_path):
+    """unix(files) -> a board with these files, which has to end up with these files and no others."""
+    some_micropython()
+    made = []
+    folder = tmp_path / "flash"
+    folder.mkdir()
+
+    def listing():
+        return {
+            str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()
+        }
+
+    def make(files):
+        for name, content in files.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(content)
+        made.append((UnixBoard(folder), files))
+        return made[0][0]
+
+    yield make
+    for board, files in made:
+        board.close()
+        assert listing() == files
 
 
-def test_the_guided_check_names_the_wrong_map_and_the_right_one(checked_board):
-    said = checked_board("robomaster_a", "axes", settings={"MAG_AXES": ["y", "x", "z"]})
-    assert "MAG_AXES is ('y', 'x', 'z'), should be ('y', '-x', '-z')" in said
+def modules(*names):
+    return {f"lib/upright/{name}.py": (paths.PACKAGE / f"{name}.py").read_bytes() for name in names}
 
 
-def test_the_guided_check_finds_a_wrong_map_of_the_imu(checked_board):
-    said = checked_board("sim", "axes", settings={"IMU_AXES": ["y", "-x", "z"]})
-    assert "IMU_AXES is ('y', '-x', 'z'), should be ('x', 'y', 'z')" in said
-
-
-def test_the_report_of_a_healthy_board(checked_board):
-    said = checked_board("robomaster_a", "report", still=True)
-    assert "sensor: MPU6500, 1000/1 Hz" in said
-    assert "magnetometer: IST8310, 100/1 Hz" in said
-    assert "tick: " in said and "1000 Hz of 1000/1" in said
+def test_a_healthy_simulated_board():
+    done = CliRunner().invoke(cli.app, ["doctor", "--simulated", "robomaster_a"])
+    assert done.exit_code == 0, done.output
+    assert "all is well" in done.output
+    assert "sensor: MPU6500, 1000/1 Hz" in done.output
+    assert "magnetometer: IST8310, 100/1 Hz" in done.output
+    assert "tick: " in done.output and "1000 Hz of 1000/1" in done.output
 
 
 @pytest.mark.parametrize(
-    "options, problem",
-    [({"imu": False}, "PROBLEM: sensor:"), ({"mag": False}, "PROBLEM: magnetometer:")],
-    ids=["no sensor", "no magnetometer"],
+    ("part", "said", "address"), [("imu", "sensor:", ""), ("mag", "magnetometer:", "0x0e")]
 )
-def test_what_does_not_answer_is_reported(checked_board, options, problem):
-    said = checked_board("robomaster_a", "report", still=True, **options)
-    assert problem in said
-    assert "all is well" not in said
+def test_what_does_not_answer_is_reported(part, said, address):
+    lines = []
+    problems = doctor.examine_simulated("robomaster_a", "cpython", lines.append, **{part: False})
+    assert any(problem.startswith(said) and address in problem for problem in problems)
+    text = "\n".join(lines)
+    assert f"PROBLEM: {said}" in text and "all is well" not in text
 
 
-def test_the_report_is_made_on_every_runtime(checked_board, runtime):
-    said = checked_board("sim", "report", runtime=runtime, still=True)
-    assert "sensor: MPU6050, 1000/1 Hz" in said
-    assert runtime == "cpython" or "bytes free" in said
+def test_the_report_is_made_on_every_runtime(runtime):
+    lines = []
+    doctor.examine_simulated("sim", runtime, lines.append)
+    text = "\n".join(lines)
+    assert "sensor: MPU6050, 1000/1 Hz" in text
+    assert runtime == "cpython" or "bytes free" in text
+
+
+@pytest.mark.parametrize("folder", sorted(p.parent.name for p in paths.BOARDS.glob("*/board.py")))
+def test_every_board_boots_its_parts_in_simulation(folder):
+    """What its board.py constructs is there, and the timer that it asks for can be had."""
+    lines = []
+    problems = doctor.examine_simulated(folder, "cpython", lines.append)
+    if folder == "esp32":
+        (problem,) = problems
+        assert "no hard timer" in problem
+    else:
+        assert problems == []
+
+
+LACKS = "inertial.py is not on this board"
+
+
+@pytest.mark.parametrize(
+    "there, said",
+    [
+        ((), LACKS),
+        (("__init__",), LACKS),
+        (("__init__", "settings", "mpu_monitor", "mpu_parts"), LACKS),
+        (contents.library(BOARD.decode()), "nobody at 0x68"),
+    ],
+)
+def test_the_doctor_runs_from_ram_with_what_the_board_lacks(unix, there, said):
+    lines = []
+    transport = unix({"board.py": BOARD} | modules(*there))
+    problems = doctor.examine(transport, False, False, lines.append)
+    assert problems[0] == "this build of MicroPython has no timer"
+    assert any(said in problem for problem in problems[1:]), problems
+    assert lines[1].startswith("a board, micropython 1.")
+    assert ("tick: no timer here" in problems) == (said != LACKS)
+
+
+def test_the_self_test_is_there_for_the_doctor_though_no_installation_has_it(unix):
+    transport = unix({"board.py": BOARD} | modules("__init__", "settings"))
+    doctor.examine(transport, False, False, print)
+    transport.exec("from upright import mpu_selftest\nprint(mpu_selftest.run)")
+
+
+def test_a_board_without_a_board_py_or_for_another_port_is_named(unix):
+    with pytest.raises(device.DeviceError, match="upright flash"):
+        doctor.examine(unix({}), False, False, print)
+
+
+def test_a_board_py_for_another_port_is_named(unix):
+    problems = doctor.examine(
+        unix({"board.py": BOARD.replace(b"linux", b"esp32")}), False, False, print
+    )
+    assert "board.py is for the port 'esp32', this is 'linux'" in problems
+
+
+def test_lines_of_a_board_are_passed_on_as_they_come_in_whatever_pieces():
+    plain, marked = [], []
+    lines = doctor.Lines({"\x1e": marked.append}, plain.append)
+    for piece in (b"heap: 1", b"00 bytes\r\nsen", b"sor: x\r\n\x1e['bad']\r\n"):
+        lines.feed(piece)
+    assert plain == ["heap: 100 bytes", "sensor: x"]
+    assert marked == ["['bad']"]
+
+
+def test_the_check_of_the_axes_is_asked_for_by_its_hemisphere(monkeypatch):
+    ran = []
+
+    class Board:
+        def fs_readfile(self, name):
+            return b""
+
+        def exec(self, code, data_consumer=None):
+            ran.append(code)
+            data_consumer(b"\x1e[]\n")
+
+    monkeypatch.setattr(device, "facts", lambda transport: FACTS)
+    monkeypatch.setattr(ram, "load", lambda *a: None)
+    assert doctor.examine(Board(), True, True, print) == []
+    assert "doctor.axes(board, True)" in ran[0]
+
+
+def test_a_recording_comes_over_the_line_and_nothing_is_written_to_the_board(unix, tmp_path):
+    lines = []
+    transport = unix({"board.py": SENSOR} | modules("__init__", "settings"))
+    file = tmp_path / "rest.imu"
+    size = record.record(transport, file, 1, 100, lines.append)
+    found = recordings.load(file)
+    assert file.stat().st_size == size
+    accel, gyro = found.inertial()
+    assert len(accel) >= 90
+    assert (found.rate, found.chip, found.board) == (100, "MPU6050", "a board")
+    assert {tuple(row) for row in accel.tolist()} == {(0.0, 0.0, 1.0)} or accel[:, 2].std() == 0
+    assert not gyro.any()
+    assert "done" in lines and any("rows" in line for line in lines)
+
+
+@pytest.mark.parametrize("which", [("--simulated", "sim"), ("--emulated",)])
+def test_nobody_turns_a_simulated_board(which):
+    done = CliRunner().invoke(cli.app, ["doctor", *which, "--axes"])
+    assert done.exit_code == console.WRONG
+    assert "real one" in done.output
