@@ -27,7 +27,7 @@ def test_a_module_that_is_not_on_the_board_is_named(monkeypatch):
 
 
 def test_no_samples_can_be_handed_to_a_filter_in_the_sensor():
-    with pytest.raises(ValueError, match="computed in the sensor"):
+    with pytest.raises(ValueError, match="dmp6 runs in the sensor: it cannot take samples"):
         filters.make("dmp6", 200, Scales, {})
 
 
