@@ -2,6 +2,7 @@
 
 import importlib.util
 import math
+import sys
 from array import array
 
 import kernel
@@ -225,6 +226,18 @@ def test_a_body_that_turns_or_lies_on_its_side_has_no_level():
     run(0.1)
     with pytest.raises(ValueError, match="hold it still"):
         imu.level()
+    world.set((0, 0, 0))  # falls
+    run(0.1)
+    with pytest.raises(ValueError, match="hold it still"):
+        imu.level()
+    chips = machine.I2C(0)._bus.chips
+    there = chips.pop()
+    for _ in range(5):
+        run(0.1)
+        imu.angles()
+    with pytest.raises(ValueError, match="the sensor gives none"):
+        imu.level()
+    chips.append(there)
     imu.stop()
     world.set(gravity(60, 0))
     imu.start()
@@ -270,6 +283,56 @@ def test_starting_again_stops_the_one_before_on_the_same_chip():
     assert machine.I2C(0)._bus.cuts == 0
 
 
+@pytest.mark.parametrize("first, second", [(None, 0x69), (0x69, None), (None, None)])
+def test_a_chip_that_was_found_by_search_is_the_same_chip(first, second):
+    chip((0, 0, G), 0x69)
+    start = [
+        upright.AHRS(MPU6050(bus(), address), rate, measure_bias=False, log=None)
+        for address, rate in ((first, 200), (second, 100))
+    ]
+    for imu in start:
+        imu.start()
+    assert ahrs.running == start[1:]
+
+
+@pytest.mark.parametrize("drive", ["timer", "fifo"])
+@pytest.mark.parametrize("what", ["start", "stop"])
+def test_after_a_ctrl_c_at_any_line_of_start_and_stop_the_bus_can_be_had(drive, what):
+    names = {"start", "stop", "_hold", "_run_together", "make_tick", "_make_tick", "__init__"}
+    left = [0]
+
+    def trace(frame, event, _):
+        code = frame.f_code
+        if "/lib/upright/" not in code.co_filename or code.co_name not in names or kernel.in_irq():
+            return None
+        if event == "line":
+            left[0] -= 1
+            if left[0] == 0:
+                raise KeyboardInterrupt
+        return trace
+
+    chip((0, 0, G))
+    for n in range(1, 1000):
+        imu = upright.AHRS(MPU6050(bus()), drive=drive, measure_bias=False, log=None)
+        if what == "stop":
+            imu.start()
+        left[0] = n
+        sys.settrace(trace)
+        try:
+            getattr(imu, what)()
+        except KeyboardInterrupt:
+            pass
+        finally:
+            sys.settrace(None)
+        upright.stop()
+        assert transfers(0.05) == 0
+        if left[0] > 0:
+            break
+    assert n > 5
+    imu.start()
+    assert transfers(0.05) > 0
+
+
 def test_start_and_stop_of_the_package_are_those_of_board_py():
     chip((0, 0, G))
     imu = upright.start(rate=100, measure_bias=False, log=None)
@@ -282,16 +345,12 @@ def test_start_and_stop_of_the_package_are_those_of_board_py():
 
 
 def test_without_board_py_it_says_what_to_do(monkeypatch):
-    import sys
-
     monkeypatch.setitem(sys.modules, "board", None)
     with pytest.raises(ImportError, match=r"upright.AHRS\(MPU6050\(i2c\)\)"):
         upright.start()
 
 
 def test_what_a_board_py_lacks_is_not_taken_for_a_missing_board_py(monkeypatch, tmp_path):
-    import sys
-
     (tmp_path / "board.py").write_text("import no_such_driver\n")
     monkeypatch.delitem(sys.modules, "board", raising=False)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -508,6 +567,67 @@ def test_every_wrong_setting_is_named_at_once_and_before_anything_moves():
     assert transfers(0) == 0 == machine.I2C(0)._bus.bytes
 
 
+WRONG = [
+    ("sensor_rate_hz", (1000, 0)),
+    *(("gyro_range_dps", x) for x in ([250], 250.0)),
+    *(("dlpf", x) for x in ("2", [1], 2.0)),
+    *(("filter", x) for x in (["mahony6"], "", 0)),
+    *(("imu_axes", x) for x in (None, "xyz")),
+    *(("gains", x) for x in (None, [("kp", 1)])),
+    ("accel_range_g", 2.0),
+    ("measure_bias", "no"),
+    ("display_shares_bus", None),
+    ("dmp_image", 5),
+    ("log", 5),
+    ("timer", "7"),
+    ("timer", lambda rate, callback: None),
+    ("magnetometer", "ist8310"),
+    ("magnetometer", lambda sensor: None),
+    ("display", object()),
+    ("display", lambda chunk: object()),
+    ("data_ready", lambda: 5),
+]
+
+
+@pytest.mark.parametrize("name, value", WRONG)
+def test_a_wrong_setting_or_part_is_a_valueerror_that_names_it(name, value):
+    chip((0, 0, G))
+    more = {"drive": "data_ready"} if name == "data_ready" else {}
+    imu = upright.AHRS(MPU6050(bus()), **{"log": None, name: value} | more)
+    named = {"timer": "timer is|make_tick", "magnetometer": "magnetometer"}
+    with pytest.raises(ValueError, match=named.get(name, f"(?i){name} is|unknown filter")):
+        imu.start()
+    assert ahrs.running == []
+
+
+@pytest.mark.parametrize("sensor", [None, MPU6050, "bus"])
+def test_what_is_no_driver_is_refused(sensor):
+    with pytest.raises(TypeError, match=r"AHRS\(MPU6050\(i2c\)\), not"):
+        upright.AHRS(bus() if sensor == "bus" else sensor, log=None)
+
+
+@pytest.mark.parametrize(
+    "i2c, address", [(None, 0x68), ("spi", 0x68), ("i2c", "0x68"), ("i2c", 300)]
+)
+def test_a_wrong_bus_or_address_is_named(i2c, address):
+    i2c = {"spi": machine.SPI(0), "i2c": bus()}.get(i2c)
+    with pytest.raises((TypeError, ValueError), match=r"not an I2C bus|address .* is not"):
+        MPU6050(i2c, address)
+    with pytest.raises(TypeError, match="not an SPI bus and a pin"):
+        MPU6500(machine.Pin(17), machine.SPI(0))
+
+
+def test_a_rate_may_be_a_list_and_a_board_py_have_a_sensor_alone():
+    chip((0, 0, G))
+    board = type("Board", (), {"RATE": [200, 1], "sensor": staticmethod(lambda: MPU6050(bus()))})
+    imu = ahrs.from_board(board, log=None, measure_bias=False).start()
+    run(0.1)
+    assert imu.tick.steps == pytest.approx(20, abs=1)
+    assert imu.board is None
+    with pytest.raises(ValueError, match=r"no sensor\(\)"):
+        ahrs.from_board(type("Board", (), {}))
+
+
 def test_an_option_that_is_none_is_refused():
     with pytest.raises(ValueError, match="no setting RATEE"):
         upright.AHRS(MPU6050(bus()), ratee=100)
@@ -524,7 +644,7 @@ def test_an_array_too_short_is_refused_and_nothing_written_behind_it():
 
 def test_without_a_display_there_is_nothing_to_refresh():
     imu, _ = start()
-    assert imu.refresh_display() is False
+    assert imu.board is None
 
 
 def test_the_temperature_of_a_reading_is_that_of_its_step():

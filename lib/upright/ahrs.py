@@ -21,6 +21,7 @@ _LOST_MS = const(300)  # so long without a fresh sample: the sensor is lost
 _HEADING_MS = const(300)  # start() waits so long for the first magnetometer sample
 _GUARD_HZ = const(50)
 _STILL_DPS = const(3)  # at most, for level()
+_STILL_G = 0.2
 _TRIAL_STEPS = const(16)
 
 # The counters of status() that add up to its `faults`
@@ -45,11 +46,13 @@ def from_board(module, **settings):
     """
     options = {
         "magnetometer": getattr(module, "magnetometer", None),
-        "timer": module.make_tick,
-        "display": module.display,
+        "timer": getattr(module, "make_tick", None),
+        "display": getattr(module, "display", None),
         "data_ready": getattr(module, "data_ready_pin", None),
-        "board": module.NAME,
+        "board": getattr(module, "NAME", None),
     }
+    if not hasattr(module, "sensor"):
+        raise ValueError("board.py has no sensor(), which returns the driver of the IMU")
     found = of_board(module)
     for name in found:
         options[name.lower()] = found[name]
@@ -101,7 +104,7 @@ class AHRS:
         log=print,
         **settings,
     ):
-        if not hasattr(sensor, "configure"):
+        if callable(sensor) or not hasattr(sensor, "configure"):  # callable: the class itself
             raise TypeError("the sensor is a driver, as in AHRS(MPU6050(i2c)), not %r" % (sensor,))
         if on_step is not None and not callable(on_step):
             raise TypeError("on_step is a function that takes the AHRS, not %r" % (on_step,))
@@ -145,7 +148,7 @@ class AHRS:
         self.stop()
         settings = self.settings
         axes = 6 if self._magnetometer is None else 9
-        settings.check(axes)
+        settings.check(axes, more=self._wrong_parts())
         neighbours = self._neighbours()
         self.drive = self._choose_drive(neighbours)
         settings.check(axes, self.drive)
@@ -155,6 +158,8 @@ class AHRS:
             self._set_up(settings.filter_name(axes))
             running.append(self)
             _run_together(neighbours + [self])
+            what = self.ticker.what if self.ticker else "calls of step()"
+            self.log("tick: %s, every %d us, %s drive" % (what, self.period_us, self.drive))
         except BaseException:
             if self in running:
                 running.remove(self)
@@ -162,16 +167,14 @@ class AHRS:
             if neighbours:
                 _run_together(neighbours)
             raise
-        what = self.ticker.what if self.ticker else "calls of step()"
-        self.log("tick: %s, every %d us, %s drive" % (what, self.period_us, self.drive))
         return self
 
     def stop(self):
         """Stop the tick. The bus belongs to the program again. The last attitude stays."""
         if self not in running:
             return
-        running.remove(self)
         self._hold()
+        running.remove(self)
         bus = _place(self)[0]
         neighbours = [other for other in running if bus is not None and _place(other)[0] == bus]
         if neighbours:
@@ -186,14 +189,43 @@ class AHRS:
     def _neighbours(self):
         """The running AHRS on the same bus. One of the same chip is stopped: an earlier program has left it running."""
         bus, chip = _place(self)
+        # a driver without an address takes the only chip of the bus
+        search = getattr(getattr(self._driver, "port", None), "searches", False)
         found = []
         for other in list(running):
             if bus is not None and _place(other)[0] == bus:
-                if _place(other)[1] == chip:
+                if search or _place(other)[1] == chip:
                     other.stop()
                 else:
                     found.append(other)
         return found
+
+    def _wrong_parts(self):
+        """What cannot be used of the objects and functions that were handed over, a line for each."""
+        wrong = []
+
+        def demand(name, part, has, wanted):
+            if not all([hasattr(part, method) for method in has.split()]):
+                wrong.append("%s is %r, expected %s" % (name, part, wanted))
+
+        mag, timer = self._magnetometer, self._timer
+        if mag is not None and not callable(mag):
+            demand("magnetometer", mag, "configure own_bus", "a driver or a function")
+        if self.display is not None:
+            demand("display", self.display, "begin flush_step", "one of upright/ssd1306.py")
+        if timer is not None and not callable(timer) and not isinstance(timer, int):
+            wrong.append("timer is %r, expected its number or a make_tick()" % (timer,))
+        functions = {"say": self.say, "log": self.log}
+        for name in functions:
+            if functions[name] is not None and not callable(functions[name]):
+                wrong.append("%s is %r, expected a function" % (name, functions[name]))
+        if self.settings.DRIVE == "data_ready":
+            demand("data_ready", self._pin(), "irq", "the pin that INT is on")
+        return wrong
+
+    def _pin(self):
+        pin = self._data_ready
+        return pin() if callable(pin) and not hasattr(pin, "irq") else pin
 
     def _choose_drive(self, neighbours):
         """Choose the drive, and check its timer: one is made for a moment."""
@@ -217,8 +249,6 @@ class AHRS:
             probe.stop()
             soft = not probe.hard and settings.filter_name(6) not in filters.HARDWARE
             drive = "fifo" if soft else "timer"
-        if drive == "data_ready" and self._data_ready is None:
-            raise ValueError('DRIVE is "data_ready": data_ready has to be the pin that INT is on')
         if drive != "manual":
             rates = {"timer": settings.RATE, "fifo": settings.FIFO_HZ, "data_ready": _GUARD_HZ}
             self._make_tick(rates[drive], _nothing).stop()
@@ -226,12 +256,19 @@ class AHRS:
 
     def _make_tick(self, rate, callback):
         if callable(self._timer):
-            return self._timer(rate, callback)
+            ticker = self._timer(rate, callback)
+            if not hasattr(ticker, "what"):
+                raise ValueError(
+                    "make_tick() returned %r, expected a Ticker (timing.py)" % (ticker,)
+                )
+            return ticker
         from upright import timing
 
         return timing.make_tick(rate, callback, self._timer)
 
     def _hold(self):
+        if self.tick is not None:
+            self.tick.hold()
         for name in ("ticker", "_guard"):
             ticker = getattr(self, name)
             if ticker is not None:
@@ -311,7 +348,10 @@ class AHRS:
         if mag is None:
             return
         sensor, settings = self.sensor, self.settings
-        self.magnetometer = mag = mag(sensor) if callable(mag) else mag
+        mag = mag(sensor) if callable(mag) else mag
+        if not hasattr(mag, "own_bus"):
+            raise ValueError("magnetometer() returned %r, expected a driver" % (mag,))
+        self.magnetometer = mag
         self._own_mag = mag if mag.own_bus else None
         rate = settings.RATE if settings.EXTERNAL_CLOCK else sensor.sample_rate
         if self._own_mag is None and self.drive == "timer" and rate != settings.RATE:
@@ -497,14 +537,18 @@ class AHRS:
         """Make the present position level: the trim of a tilted mounting, up to 45 degrees. `save` stores it in the
         calibration file. Hold the body at rest: the tick is stopped meanwhile, and the filter settles anew.
 
-        Raises ValueError while the body turns, and for more tilt.
+        Raises ValueError while the body moves, without samples, and for more tilt.
         """
         if self._filter_in_sensor:
             raise ValueError(
                 "the DMP's attitude cannot be trimmed: use IMU_AXES, or another filter"
             )
         reading = self.reading()
-        if max([abs(rate) for rate in reading.rates()]) > _STILL_DPS:
+        if self.status()["sensor_lost"] and not reading.flags & 1:
+            raise ValueError("level() needs samples, and the sensor gives none")
+        moves = max([abs(rate) for rate in reading.rates()]) > _STILL_DPS
+        # and the filter has settled: what it calls down is where gravity is, as far as a sensor's offsets go
+        if moves or max([abs(a) for a in reading.linear_acceleration()]) > _STILL_G:
             raise ValueError("level() is for a body at rest: hold it still")
         together = [other for other in running if other.ticker is self.ticker]
         for other in together:
@@ -645,6 +689,8 @@ class AHRS:
     def _why(self):
         if self not in running:
             return "it is stopped"
+        if self.drive == "manual":
+            return "the program calls step()"
         return (
             "the data-ready line is silent" if self.drive == "data_ready" else "the timer is silent"
         )
@@ -697,9 +743,7 @@ def _run_together(members):
     if first.drive == "data_ready":
         from upright import timing
 
-        pin = first._data_ready
-        pin = pin() if callable(pin) and not hasattr(pin, "irq") else pin
-        first.ticker = timing.DataReady(pin, first.tick.on_sample, first.period_us)
+        first.ticker = timing.DataReady(first._pin(), first.tick.on_sample, first.period_us)
         first._guard = first._make_tick(_GUARD_HZ, first.tick.on_guard)
         return
     fifo = first.drive == "fifo"

@@ -25,7 +25,7 @@ def default(magnetometer):
 
 def check(name):
     """Raise ValueError for an unknown name."""
-    if name not in FILTERS:
+    if not isinstance(name, str) or name not in FILTERS:
         raise ValueError("unknown filter %r; there are %s" % (name, ", ".join(sorted(FILTERS))))
 
 

@@ -36,7 +36,7 @@ class I2CPort:
             i2c, _ADDRESSES[0] if address is None else address, error_class, mpu_parts.name
         )
         self._error_class = error_class
-        self._search = address is None
+        self.searches = address is None
         self._accept_unknown = accept_unknown
         self._name = name
         self._only_6500 = only_6500
@@ -51,10 +51,10 @@ class I2CPort:
     def find(self):
         answers = {}
         for _ in range(11):
-            answers = self._ask(_ADDRESSES if self._search else (self.registers.address,))
+            answers = self._ask(_ADDRESSES if self.searches else (self.registers.address,))
             if any(self._is_wanted(who) for who in answers.values()):
                 break
-            if answers and not self._search:
+            if answers and not self.searches:
                 break
             time.sleep_ms(10)  # just powered up, the chip may take 100 ms to answer
         if not answers:
@@ -106,7 +106,7 @@ class I2CPort:
     def _absent(self):
         tried = "(WHO_AM_I: no answer to 11 reads in 0.1 s)"
         check = "Check supply, SDA, SCL and their pull-ups"
-        if self._search:
+        if self.searches:
             return f"no {self._name} at 0x68 or 0x69; {check} {tried}"
         address = self.registers.address
         other = 0x69 if address == 0x68 else 0x68

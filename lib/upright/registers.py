@@ -72,10 +72,19 @@ class I2CRegisters(Registers):
 
     def __init__(self, i2c, address, error_class=OSError, name=plain_name):
         Registers.__init__(self, error_class, name)
+        if not hasattr(i2c, "readfrom_mem_into"):
+            raise TypeError(f"{i2c!r} is not an I2C bus")
+        if not isinstance(address, int) or not 0x08 <= address <= 0x77:
+            raise ValueError(f"address {address!r} is not an int, 0x08 to 0x77")
         self.address = address
-        self.place = (i2c, address)  # what nothing else has: see ahrs.py
+        self.bus = i2c
         self._out = bytearray(2)
         self.bind(i2c)
+
+    @property
+    def place(self):
+        """What no other chip has, see ahrs.py."""
+        return self.bus, self.address
 
     def bind(self, i2c):
         """Use this bus. Its methods are looked up once, here: a call of what is stored allocates nothing."""
@@ -117,6 +126,8 @@ class SPIRegisters(Registers):
         self, spi, cs, fast_hz, slow_hz, fast=(0, -1), error_class=OSError, name=plain_name
     ):
         Registers.__init__(self, error_class, name)
+        if not hasattr(spi, "readinto") or not callable(cs):
+            raise TypeError(f"{spi!r} and {cs!r} are not an SPI bus and a pin")
         self.slow_hz = slow_hz
         self.fast_hz = fast_hz
         self.burst_hz = 0  # 0: the clock is not changed

@@ -89,28 +89,29 @@ class Settings:
             setattr(self, name, given.get(name, DEFAULTS[name]))
         if is_int(self.RATE, 1):
             self.RATE = (self.RATE, 1)
+        elif isinstance(self.RATE, list):
+            self.RATE = tuple(self.RATE)
 
-    def check(self, axes=6, drive=None):
-        """Check every setting, for sensors with so many axes. drive: the drive that was chosen for DRIVE = None.
+    def check(self, axes=6, drive=None, more=()):
+        """Check every setting, for sensors with so many axes. drive: the drive that was chosen for DRIVE = None. more:
+        lines about what else is wrong.
 
         Raises ValueError that lists all wrong settings, each with what to change. What depends on the chip and on the
         timer is checked later.
         """
-        wrong = []
-        rate = self.RATE
-        good_rate = isinstance(rate, (tuple, list)) and len(rate) == 2
-        good_rate = good_rate and is_int(rate[0], 1) and is_int(rate[1], 1)
-        self._demand(wrong, "RATE", good_rate, "Hz as a positive int, or (num, den) for num/den Hz")
+        wrong = list(more)
+        hz = "Hz as a positive int, or (num, den) for num/den Hz"
+        self._demand(wrong, "RATE", _is_pair(self.RATE), hz)
         drives = self.DRIVE is None or self.DRIVE in DRIVES
         self._demand(wrong, "DRIVE", drives, ", ".join(['"%s"' % name for name in DRIVES]))
         self._demand(wrong, "FIFO_HZ", is_int(self.FIFO_HZ, 1, 1000), "Hz as an int, 1..1000")
         self._demand(wrong, "MAG_RATE_HZ", is_int(self.MAG_RATE_HZ, 1), "Hz as a positive int")
         good = self.SENSOR_RATE_HZ is None or is_int(self.SENSOR_RATE_HZ, 1)
         self._demand(wrong, "SENSOR_RATE_HZ", good, "Hz as a positive int, or None")
-        self._demand(wrong, "ACCEL_RANGE_G", self.ACCEL_RANGE_G in _ACCEL_RANGES, "2, 4, 8 or 16")
-        self._demand(
-            wrong, "GYRO_RANGE_DPS", self.GYRO_RANGE_DPS in _GYRO_SCALES, "250, 500, 1000 or 2000"
-        )
+        good = is_int(self.ACCEL_RANGE_G, 1) and self.ACCEL_RANGE_G in _ACCEL_RANGES
+        self._demand(wrong, "ACCEL_RANGE_G", good, "2, 4, 8 or 16")
+        good = is_int(self.GYRO_RANGE_DPS, 1) and self.GYRO_RANGE_DPS in _GYRO_SCALES
+        self._demand(wrong, "GYRO_RANGE_DPS", good, "250, 500, 1000 or 2000")
         good = self.DLPF in (None, "bypass") or is_int(self.DLPF, 0, 7)
         self._demand(wrong, "DLPF", good, "0..7; mpu.py has the bandwidths")
         self._demand(wrong, "EULER", self.EULER in ("zyx", "zxy"), '"zyx" or "zxy"')
@@ -132,10 +133,14 @@ class Settings:
             filters.check(self.filter_name(axes))
         except ValueError as why:
             wrong.append(str(why))
+        for name in ("IMU_AXES", "MAG_AXES"):
+            self._demand(wrong, name, isinstance(getattr(self, name), (tuple, list)), "three axes")
         try:
             calibration.Calibration(self.IMU_AXES, self.MAG_AXES)
-        except (ValueError, TypeError) as why:
+        except ValueError as why:
             wrong.append(str(why))
+        except TypeError:
+            pass  # it has been named
         if not wrong:
             self._check_combinations(wrong, axes, drive or self.DRIVE)
         if wrong:
@@ -148,7 +153,7 @@ class Settings:
                 "with FIFO_HZ %d the FIFO drive keeps up with %d Hz: FIFO_HZ %d, or a lower RATE"
                 % (self.FIFO_HZ, FIFO_BATCH * self.FIFO_HZ, -(-num // (FIFO_BATCH * den)))
             )
-        if drive == "timer" and is_int(self.SENSOR_RATE_HZ, 1) and not self.EXTERNAL_CLOCK:
+        if drive == "timer" and self.SENSOR_RATE_HZ is not None and not self.EXTERNAL_CLOCK:
             if self.SENSOR_RATE_HZ * den < num:
                 wrong.append(
                     "SENSOR_RATE_HZ is %d: the chip has to sample at RATE or faster"
@@ -164,7 +169,7 @@ class Settings:
             wrong.append(str(why))
 
     def filter_name(self, axes):
-        return self.FILTER or filters.default(axes == 9)
+        return filters.default(axes == 9) if self.FILTER is None else self.FILTER
 
     def _demand(self, wrong, name, good, wanted):
         if not good:
@@ -177,6 +182,11 @@ class _Scales:
     def __init__(self, settings):
         self.gyro_scale = _GYRO_SCALES[settings.GYRO_RANGE_DPS]
         self.accel_lsb_per_g = 32768 // settings.ACCEL_RANGE_G
+
+
+def _is_pair(value):
+    pair = isinstance(value, (tuple, list)) and len(value) == 2
+    return pair and is_int(value[0], 1) and is_int(value[1], 1)
 
 
 def _is_number(value, low, high=None):

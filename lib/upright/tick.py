@@ -366,9 +366,13 @@ class Tick:
         self._calibration = calibration
         self._counts = self._raw if calibration is None else calibration.counts
 
+    def hold(self):
+        """Do nothing until resume(), should a timer still call: a Ctrl-C may have come while it was stopped."""
+        self._running = True
+
     def resume(self):
         """Call before stopped ticks go on: ticks of the pause are not counted as missed."""
-        self._started = False
+        self._running = self._started = False
         self._coasted_ahead = 0
 
     # -- for programs, interrupts and a second core: nothing here allocates
