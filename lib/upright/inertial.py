@@ -316,7 +316,6 @@ class Inertial9(EarthFilter):
             r = _R
             while i < 3:
                 n = s[_TURN + i] << k >> k
-                s[_TURN + i] = 0
                 m = (n + 16384) >> 15
                 n -= m << 15
                 o = s[r] << k >> k
@@ -327,6 +326,7 @@ class Inertial9(EarthFilter):
                 z += o * m + (o * n + 16384 >> 15)
                 r += 3
                 i += 1
+            s[_TURN + 2] = 0  # the others are of each step
         s[_WR] = u & 32767
         s[_W] = x + (u >> 15)
         s[_WR + 1] = v & 32767
