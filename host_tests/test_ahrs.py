@@ -166,9 +166,9 @@ def test_a_reading_is_of_one_step_however_late_it_is_asked():
     assert imu.reading().step > reading.step
 
 
-def nine(**options):
-    """North is ahead; the field of central Europe."""
-    world = StillWorld((0, 0, G, 0, 0, 0, 82, 0, -141))
+def nine(north=(82, 0), **options):
+    """Where north is in the body, x and y: ahead by default; the field of central Europe."""
+    world = StillWorld((0, 0, G, 0, 0, 0, *north, -141))
     world.start(0)
     imu = MPU6500Chip(world)
     imu.aux.append(IST8310Chip(world))
@@ -192,6 +192,16 @@ def test_the_heading_counts_clockwise_from_true_north():
         assert imu.status()["field_accepted"] is not None
 
 
+def test_the_heading_falls_when_the_body_turns_left_and_is_not_zeroed():
+    with nine((0, -82), declination=5, log=None) as imu:  # it faces west
+        run(1)
+        assert imu.angles()[2] == pytest.approx(90, abs=0.5)
+        assert imu.heading() == pytest.approx(275, abs=0.5)
+        imu.zero_yaw()
+        assert imu.angles()[2] == pytest.approx(0, abs=0.5)
+        assert imu.heading() == pytest.approx(275, abs=0.5)
+
+
 # ------------------------------------------------------------------------------- level
 
 
@@ -200,6 +210,7 @@ def test_a_tilted_mounting_is_trimmed_and_stays_so():
     run(10)
     imu.level()
     assert imu.angles() == pytest.approx((0, 0, imu.angles()[2]), abs=0.1)
+    assert imu.rates() == pytest.approx((0, 0, 0), abs=0.05)  # the bias has turned, too
     run(2)
     assert imu.angles()[:2] == pytest.approx((0, 0), abs=0.2)
     assert imu.acceleration() == pytest.approx((0, 0, 1), abs=1e-3)
