@@ -239,8 +239,8 @@ class QuaternionKalman9(EarthFilter):
     PARAMETERS = {
         "gyro_noise": (0.043, 0.001, 1),  # random walk of the attitude, vibration included, deg/s per root Hz
         "bias_walk": (0.0033, 0, 0.1),  # random walk of the bias, deg/s per root s, no more than bias_start / 20
-        # the faster the body turns, the less the gyro is believed: noise of so many times the rate per root Hz;
-        # a quarter of it about the vertical
+        # gyro noise that grows with the rate of turn: so many times the rate per root Hz; a quarter of it about the
+        # vertical
         "scale_error": (0.007, 0, 0.02),
         # of the tilt from one block of the accelerometer, g, where so little is known of the tilt (15 deg) that it is
         # believed as it is
@@ -249,8 +249,8 @@ class QuaternionKalman9(EarthFilter):
         "mag_noise": (0.15, 0.01, 0.2),  # of the heading, rad per root Hz
         # first sigma of the bias (on top of set_bias), which is no larger than 2.5 of them, deg/s
         "bias_start": (3.3, 0.5, 10),
-        # nothing but rest tells of the bias before this time, s: a start in motion is a wrong start, and its
-        # corrections are not those of a bias
+        # before this time only rest shows the bias, s: after a start in motion the corrections are those of a wrong
+        # attitude, not of a bias
         "bias_after": (5, 0, 60),
         "rest_noise": (0.03, 0.01, 1),  # of the averaged gyro at rest, deg/s per root Hz
         "rest_gyro_dps": (2, 0.1, 10),  # at rest the gyro's mean of a block stays this near to its average, deg/s
