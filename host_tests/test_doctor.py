@@ -190,8 +190,8 @@ def test_a_recording_comes_over_the_line_and_nothing_is_written_to_the_board(uni
     size = record.record(transport, file, 1, 100, lines.append)
     found = recordings.load(file)
     assert file.stat().st_size == size
+    assert len(found.counts) == 100  # a sample that was missed on a busy machine has its row, too
     accel, gyro = found.inertial()
-    assert len(accel) >= 90
     assert (found.rate, found.chip, found.board) == (100, "MPU6050", "a board")
     assert {tuple(row) for row in accel.tolist()} == {(0.0, 0.0, 1.0)} or accel[:, 2].std() == 0
     assert not gyro.any()
