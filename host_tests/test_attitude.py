@@ -370,6 +370,8 @@ def test_an_accelerometer_that_cannot_be_used_is_not_and_one_that_can_is(name, w
 
 # -- the same bits everywhere, and the same as ever
 STATES = {"mahony6": "mahony", "mahony9": "mahony", "euler6": "euler", "kalman6": "kalman"}
+STATES |= dict.fromkeys(("inertial6", "inertial9", "inertial9-lite"), "inertial")
+STATES |= dict.fromkeys(("quaternion-kalman6", "quaternion-kalman9"), "quaternion_kalman")
 # what switches on more than the defaults do
 GAINS = {
     "mahony6": {"kp": 1, "ki": 0.02},
@@ -425,8 +427,8 @@ def test_an_allocation_in_the_tick_is_caught(portable, micropython_runtime, wast
 
 def hashed(filter_history, rendered, name):
     """Of the whole history of a filter's state, the words by their names: their order may change."""
-    state = STATES.get(name, "inertial" if name.startswith("inertial") else "quaternion_kalman")
-    table = words.STATES[state]
+    assert name in STATES, "say in STATES which table of words.py it has"
+    table = words.STATES[STATES[name]]
     at = [table[word].at + i for word in sorted(table) for i in range(table[word].length)]
     got = filter_history(quickest(), rendered, name, words=at, mag_every=3)
     return f"{zlib.crc32(got.q29.tobytes() + got.words.tobytes()):08x}"
@@ -450,4 +452,5 @@ def test_every_word_of_its_state_is_what_it_has_been(filter_history, name):
     if os.environ.get("RECORD"):
         known[name] = known.get(name, {}) | found
         RECORD.write_text(json.dumps(known, indent=1) + "\n")
+    assert name in known, "a new filter: run this test once with RECORD=1 in the environment"
     assert {what: known[name][what] for what in found} == found
