@@ -150,7 +150,10 @@ def summary(outcome: Outcome) -> list[str]:
     """What the run came to, for people."""
     r = outcome.result
     if not r["started"]:
-        return ["the tick never started: see the board's console above"]
+        return [
+            f"the tick had not started after {r['ended_us'] / 1e6:.1f} s: the board measures "
+            "the gyro's bias first, for a second at rest. If that was time enough, see its console above"
+        ]
     lines = []
     s = outcome.score
     if s and s.samples:

@@ -502,6 +502,8 @@ def run(transport, board: str, source: bool, force: bool, everything: bool = Fal
     with progress("copying") as at:
         staged = execute(transport, steps, lambda name, done, total: at(done, total, name))
     say("verified by hash and put in place")
+    for name in steps.backup:
+        say(f"{name}: the one that was there is {name}{BACKUP} now")
     if not staged:
         say("(in the place of the old files, since there was no room beside them)")
     return True
