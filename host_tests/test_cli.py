@@ -34,7 +34,9 @@ def test_demo_on_cpython_alone_says_that_it_cannot_see_allocations(upright):
     assert "not measured" in done.output
 
 
-def test_demo_plays_a_trial_through_the_chip(upright, trial):
+@pytest.mark.parametrize("rate", [200, 300])  # one that the chip has, and one that it has not
+def test_demo_plays_a_trial_through_the_chip(upright, tmp_path, rate):
+    trial = save(tmp_path / "synthetic.npz", rate=rate, seconds=5)
     done = upright("demo", "--headless", "--trial", trial)
     assert done.exit_code == 0, done.output
     assert "data-ready" in done.output

@@ -329,8 +329,9 @@ class AHRS:
             sensor.configure()
             self.log("dmp: image %s, %d bytes" % (sensor.version, sensor.image.size))
         else:
-            # SENSOR_RATE_HZ is for the timer drive only
-            faster = settings.SENSOR_RATE_HZ if self.drive in ("timer", "manual") else None
+            # SENSOR_RATE_HZ is for the timer drive, and for a chip whose clock is not its own
+            own_rate = self.drive in ("timer", "manual") or settings.EXTERNAL_CLOCK
+            faster = settings.SENSOR_RATE_HZ if own_rate else None
             sensor.configure(
                 accel_range_g=settings.ACCEL_RANGE_G,
                 gyro_range_dps=settings.GYRO_RANGE_DPS,
