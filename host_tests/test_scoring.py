@@ -128,9 +128,7 @@ def test_an_output_that_stops_early_says_how_much_it_covers(hand):
     movement = np.arange(hand.n) >= 1000
     s = scoring.score(hand.t[:500], hand.q_true[:500], hand.t, hand.q_true, movement)
     assert s.samples == 0 and math.isnan(s.total) and s.coverage == 0
-    assert s.lines() == [
-        "no sample of the output meets the truth of a movement phase: nothing to score"
-    ]
+    assert s.lines() == ["nothing to score: there is no truth of the movement in this span"]
     one = scoring.score_motion(hand.q_true[:1], hand)
     assert one.samples == 1 and one.total < 1e-5
 

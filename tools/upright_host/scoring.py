@@ -42,7 +42,7 @@ class Score:
     def lines(self) -> list[str]:
         """The few lines that a person reads."""
         if not self.samples:
-            return ["no sample of the output meets the truth of a movement phase: nothing to score"]
+            return ["nothing to score: there is no truth of the movement in this span"]
         lines = [
             f"inclination    {self.inclination:7.3f} deg RMSE, {self.max_inclination:.2f} at most",
             f"as given       heading {self.heading:7.3f}  total {self.total:7.3f}",
