@@ -395,6 +395,8 @@ def test_i2c_through_the_machine_takes_the_time_that_the_docstring_says():
         ({"panel": None}, "name the panel"),
         ({"chunk": 0}, "chunk"),
         ({"chunk": 33}, "chunk"),
+        ({"chunk": "a"}, "chunk must be .*'a'"),
+        ({"chunk": 32.0}, "chunk"),
         ({"rotate": 90}, "rotate"),
         ({"column_offset": 1}, "column_offset must be 0 to 0"),
         ({"panel": "SH1106 128x64", "column_offset": 5}, "0 to 4"),
@@ -418,6 +420,10 @@ def test_a_call_as_of_micropython_libs_driver_is_told_how_it_is_here(name):
             getattr(ssd1306, name)(*arguments)
     with pytest.raises(ValueError, match="dc=, the output pin that its D/C is wired to"):
         getattr(ssd1306, name)(machine.SPI(1))
+    with pytest.raises(ValueError, match="dc=, the output pin that its D/C is wired to"):
+        getattr(ssd1306, name)(machine.SPI(1), dc=9)
+    with pytest.raises(ValueError, match="None is neither an I2C nor an SPI bus"):
+        getattr(ssd1306, name)(None)
 
 
 @pytest.mark.parametrize("address", [0x3C, 0x3D])

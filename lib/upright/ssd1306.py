@@ -170,7 +170,9 @@ class SSD1306(Canvas):
                 "address is address=, the pins of SPI are dc=, rst=, cs="
             )
         i2c = hasattr(bus, "writeto")
-        if not i2c and dc is None:
+        if not i2c and not hasattr(bus, "write"):
+            raise ValueError("%r is neither an I2C nor an SPI bus" % (bus,))
+        if not i2c and not callable(dc):
             raise ValueError("a display on SPI needs dc=, the output pin that its D/C is wired to")
         if i2c and address not in (0x3C, 0x3D):
             hint = "must be 0x3C or 0x3D"
@@ -178,8 +180,8 @@ class SSD1306(Canvas):
                 hint = "is the 8-bit form, as modules print it: pass 0x%02X" % (address >> 1)
             raise ValueError("display address 0x%02X %s" % (address, hint))
         sh1106, width, height = _parse(panel)
-        if chunk % _BLOCK or not 8 <= chunk <= 128:
-            raise ValueError("chunk must be a multiple of 8 from 8 to 128 bytes, not %d" % chunk)
+        if not isinstance(chunk, int) or chunk % _BLOCK or not 8 <= chunk <= 128:
+            raise ValueError("chunk must be a multiple of 8 from 8 to 128 bytes, not %r" % (chunk,))
         if rotate not in (0, 180):
             raise ValueError("rotate must be 0 or 180, not %r" % (rotate,))
         spare = (132 if sh1106 else 128) - width
