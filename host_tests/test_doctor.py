@@ -157,6 +157,14 @@ def test_a_board_py_for_another_port_is_named(unix):
     assert "board.py is for the port 'esp32', this is 'linux'" in problems
 
 
+def test_a_board_py_that_works_out_its_port_is_examined(unix):
+    own = BOARD.replace(b'"linux"', b"str(1)")
+    assert own != BOARD
+    assert "tick: no timer here" in doctor.examine(
+        unix({"board.py": own} | modules(*contents.library(own.decode()))), False, False, print
+    )
+
+
 def test_lines_of_a_board_are_passed_on_as_they_come_in_whatever_pieces():
     plain, marked = [], []
     lines = doctor.Lines({"\x1e": marked.append}, plain.append)

@@ -26,7 +26,10 @@ def examine(transport, axes: bool, south: bool, on_line) -> list[str]:
         f"{found.machine or found.platform}: MicroPython {version}, {found.free_bytes} bytes of file system free"
     )
     ram.load(transport, found, "doctor", "axis_check")
-    wanted = contents.setting(transport.fs_readfile("board.py").decode(), "PLATFORM")
+    try:
+        wanted = contents.setting(transport.fs_readfile("board.py").decode(), "PLATFORM")
+    except ValueError:
+        wanted = None  # it is worked out on the board
     if wanted and wanted != found.platform:
         problems.append(f"board.py is for the port {wanted!r}, this is {found.platform!r}")
     call = f"doctor.axes(board, {south})" if axes else "doctor.report(board)"
