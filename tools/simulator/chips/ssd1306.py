@@ -82,7 +82,7 @@ class SSD1306Chip:
         # SSD1306 appendix: the pump is off; SH1106 (AD 8B): it comes on with the display
         self.pump = self.sh1106
         self.pump_running = False
-        self.internal_current = False
+        self.internal_uA = 0
         self.scrolling = False
         self._column_start = 0
         self._saved_column = None
@@ -330,7 +330,7 @@ class SSD1306Chip:
             self.pump = value == 0x8B
             return value & 0xFE == 0x8A and not self.display_on
         elif command == 0xAD:  # SSD1306B, SSD1315: A[4] internal current, A[5] 30 uA, not 19
-            self.internal_current = value & 0x10 != 0
+            self.internal_uA = (30 if value & 0x20 else 19) if value & 0x10 else 0
             return value & 0xCF == 0
         elif command == 0x8D:
             self.pump = value & 4 != 0
@@ -370,8 +370,8 @@ class SSD1306Chip:
 
     @property
     def dim(self):
-        """About a third of the brightness: a small panel without the internal current."""
-        return self.width < 128 and not self.sh1106 and not self.internal_current
+        """A small panel without the internal current has a third of its brightness, with 19 uA two thirds."""
+        return self.width < 128 and not self.sh1106 and self.internal_uA < 30
 
     def _ram_line(self, y):
         """RAM line shown in row y of the upright panel; None: this row is not driven."""
