@@ -653,6 +653,18 @@ def test_an_array_too_short_is_refused_and_nothing_written_behind_it():
             call(array("i", [0, 0]))
 
 
+def test_a_stored_bias_is_taken_and_counts_as_known():
+    calibration.write(
+        "upright_cal.json", calibration.blank() | {"gyro_bias_udps": [500000, 0, -250000]}
+    )
+    imu, _ = start((0, 0, G, 8, 0, -4))
+    assert imu.status()["bias_known"]
+    assert imu.status()["bias_dps"] == pytest.approx((0.5, 0, -0.25), abs=0.002)
+    imu.stop()
+    again = upright.AHRS(MPU6050(bus()), calibration=None, measure_bias=False, log=None).start()
+    assert not again.status()["bias_known"]
+
+
 def test_without_a_display_there_is_nothing_to_refresh():
     imu, _ = start()
     assert imu.board is None
