@@ -1,6 +1,7 @@
-# Finishes an interrupted installation of Upright. `upright flash` copies this file to /upright.py, with a call of one
-# of its two functions, and removes it at the end. /upright.py comes before lib/upright on the path, so `import upright`
-# runs it first in any state of lib/upright. Needs no other file of Upright. Every port.
+# Finishes an installation of Upright that was interrupted. `upright flash` knows this file by these first words (MARK
+# there). It copies it to /upright.py, with a call of one of the two functions, and removes it at the end. /upright.py
+# comes before lib/upright on the path, so `import upright` runs it first in any state of lib/upright. Needs no other
+# file of Upright. Every port.
 
 import os
 import sys
