@@ -732,3 +732,10 @@ def test_every_runtime_says_the_same(micropython_runtime, portable):
             numbers = [float(word) for word in words[2:]]
             assert numbers == pytest.approx([float(word) for word in expected[2:]], abs=2e-3)
     assert ours[-2].split()[3:] == ["0", "0"]
+
+
+@pytest.mark.parametrize("name", ["snapshot", "angles_into", "rates_into"])
+def test_readings_for_interrupts_say_so_before_the_start(name):
+    imu = upright.AHRS(MPU6050(machine.I2C(0, scl=machine.Pin(5), sda=machine.Pin(4)), 0x68))
+    with pytest.raises(RuntimeError, match=r"start\(\) comes first"):
+        getattr(imu, name)(array("i", [0] * 15))

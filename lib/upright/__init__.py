@@ -29,8 +29,12 @@ def from_board(**settings):
             "no board.py here, which `upright flash` installs; without one: "
             "imu = upright.AHRS(MPU6050(i2c)).start()"
         )
+    import gc
+
+    gc.collect()  # see filters.py
     from upright import ahrs
 
+    gc.collect()
     return ahrs.from_board(board, **settings)
 
 

@@ -645,9 +645,7 @@ class AHRS:
     def _attend(self):
         """Every call from the program does this: it raises an interrupt that came during the tick, measures the rate,
         and checks bias and DMP now and then. Returns the number of steps."""
-        tick = self.tick
-        if tick is None:
-            raise RuntimeError("not started: start() comes first")
+        tick = self._started()
         if tick.interrupt is not None:
             interrupt, tick.interrupt = tick.interrupt, None
             raise interrupt
@@ -697,25 +695,35 @@ class AHRS:
         )
 
     # ------------------------------------------------------------------------------------ for interrupts too
-    # On every core, from a hard interrupt or from on_step: nothing below allocates, waits or uses a float.
+    # On every core, from a hard interrupt or from on_step: nothing below allocates, waits or uses a float. They answer
+    # False when the tick left no whole step within 100 tries; then `out` is not to be used. Before start() they raise
+    # RuntimeError.
 
     @micropython.native
     def snapshot(self, out):
         """Copy the newest step as integers into out, array('i') of tick.SNAPSHOT_WORDS; tick.py names the words."""
-        return self.tick.snapshot(out)
+        return self._started().snapshot(out)
 
     @micropython.native
     def angles_into(self, out):
         """Roll, pitch, yaw in millidegrees into out, array('i') of 3, in the order of the setting EULER."""
-        self.tick.angles_into(out, self.settings.EULER)
+        whole = self._started().angles_into(out, self.settings.EULER)
         zero = self.yaw_zero[0]
         if zero != 0:
             out[2] = (out[2] - zero + 180000) % 360000 - 180000
+        return whole
 
     @micropython.native
     def rates_into(self, out):
         """Angular rates about body x, y, z, without the bias, in millidegrees/s into out, array('i') of 3."""
-        self.tick.rates_into(out)
+        return self._started().rates_into(out)
+
+    @micropython.native
+    def _started(self):
+        tick = self.tick
+        if tick is None:
+            raise RuntimeError("not started: start() comes first")
+        return tick
 
 
 # ------------------------------------------------------------------------------------ one tick for one bus

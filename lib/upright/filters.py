@@ -1,5 +1,7 @@
 # The registry of filters, by name. Needs the modules of those that are made, and no others. Every port.
 
+import gc
+
 # name: (module, class); a module is imported when one of its filters is made, so the others take no memory
 FILTERS = {
     "mahony6": ("mahony", "Mahony6"),
@@ -58,6 +60,7 @@ def make_hardware(name, imu, config):
 
 def _class(name):
     module, kind = FILTERS[name]
+    gc.collect()  # so that modules, which stay, do not lie scattered over a small heap
     try:
         return getattr(__import__("upright." + module, None, None, (kind,)), kind)
     except ImportError:

@@ -35,10 +35,11 @@ def examine(transport, axes: bool, south: bool, on_line) -> list[str]:
     call = f"doctor.axes(board, {south})" if axes else "doctor.report(board)"
     said = []
     lines = Lines({_MARK: lambda line: said.append(ast.literal_eval(line))}, on_line)
+    # Modules stay: collected between them, they do not lie scattered over a small heap.
     transport.exec(
-        f"import board\nfrom upright_app import doctor\nRam.files.clear()\nprint({_MARK!r} + repr({call}))",
-        data_consumer=lines.feed,
+        "import gc, board\ngc.collect()\nfrom upright_app import doctor\nRam.files.clear()\ngc.collect()"
     )
+    transport.exec(f"print({_MARK!r} + repr({call}))", data_consumer=lines.feed)
     return problems + (said[0] if said else ["the examination did not end"])
 
 
