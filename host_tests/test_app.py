@@ -47,6 +47,7 @@ def test_it_boots_and_is_right_on_every_runtime_with_the_same_bits(runtime, boot
         assert run.picture == there.picture
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("own_bus", [False, True], ids=["shared", "separate"])
 def test_no_transfer_cuts_into_another_in_ten_minutes(boot, own_bus):
     """And the failing twin below shows that it would be noticed."""
