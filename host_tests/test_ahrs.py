@@ -306,6 +306,7 @@ def test_a_chip_that_was_found_by_search_is_the_same_chip(first, second):
     assert ahrs.running == start[1:]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drive", ["timer", "fifo"])
 @pytest.mark.parametrize("what", ["start", "stop"])
 def test_after_a_ctrl_c_at_any_line_of_start_and_stop_the_bus_can_be_had(drive, what):

@@ -122,6 +122,7 @@ def test_a_first_sample_without_gravity_is_none(made, z):
 side = st.integers(-4096, 4096)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SOFTWARE)
 @settings(max_examples=15)
 @given(side, side, side)
@@ -246,6 +247,7 @@ def test_the_attitude_can_be_set(made):
         made.set_quaternion(0, 0, 0, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SOFTWARE)
 def test_what_it_does_not_take_is_refused(name):
     with pytest.raises(ValueError, match=name):
@@ -314,6 +316,7 @@ def test_a_bias_is_subtracted_to_a_256th_of_a_count(name):
     assert yaw_of(filter) == pytest.approx(expected, abs=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FREE)
 @pytest.mark.parametrize("rate", [50, 200, (2000, 7), 8000])
 @pytest.mark.parametrize("scale", [(131, 1), (131, 2), (164, 5), (82, 5)])

@@ -165,6 +165,7 @@ def test_figures_are_put_between_their_marks_and_nothing_else_changes(tmp_path):
         bench.save(figures(12), file)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ratio", "code"), [(9.9, 1), (10.1, 0)])
 def test_the_command_fails_below_the_ratio_asked_for(upright, monkeypatch, ratio, code):
     monkeypatch.setattr(bench, "measure", lambda: figures(ratio))

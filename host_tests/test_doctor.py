@@ -77,6 +77,7 @@ def modules(*names):
     return {f"lib/upright/{name}.py": (paths.PACKAGE / f"{name}.py").read_bytes() for name in names}
 
 
+@pytest.mark.slow
 def test_a_healthy_simulated_board():
     done = CliRunner().invoke(cli.app, ["doctor", "--simulated", "robomaster_a"])
     assert done.exit_code == 0, done.output

@@ -138,6 +138,7 @@ def test_a_bias_is_found_while_everything_turns_from_the_first_second(
     assert not (got.decided[5 * rate :] & STILL).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate, mag_every", PACES)
 @pytest.mark.parametrize(
     "kick", [(90, 0, 0), (0, -90, 0), (0, 0, 90), (0, 0, -40), (52, 52, 52)], ids=str

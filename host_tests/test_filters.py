@@ -142,6 +142,7 @@ def thrown(seed):
     return scene(200, 45, body_rate, accel, tuple(rng.uniform(-5, 5, 3)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["inertial6", "inertial9", "quaternion-kalman6", "quaternion-kalman9"]
 )

@@ -133,6 +133,7 @@ def test_a_board_without_hashlib_is_compared_all_the_same(board):
 # ------------------------------------------------------------------------------------------ the power fails
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "main, own_boot",
     [(1, False), (1, True), (2, False), (2, True)],
@@ -269,6 +270,7 @@ def test_without_room_for_both_the_new_takes_the_place_of_the_old(board):
     assert flash.execute(board(free=2 * need), flash.plan(board(), big(1))) is True
 
 
+@pytest.mark.slow
 def test_a_board_cut_off_between_old_and_new_says_so_and_is_installed_again(board):
     need = need_of(board, big(1))
     install(board(), big(1))

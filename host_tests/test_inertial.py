@@ -124,6 +124,7 @@ def test_six_axes_on_the_static_trial_hold_their_heading(history):
 
 
 # -- start and recovery
+@pytest.mark.slow
 @pytest.mark.parametrize("rate, mag_every", PACES)
 @pytest.mark.parametrize("moving", [False, True])
 def test_a_magnet_comes_and_goes(history, rate, mag_every, moving):
@@ -143,6 +144,7 @@ def test_a_magnet_comes_and_goes(history, rate, mag_every, moving):
             assert np.abs(heading[10 * rate :]).max() > 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate, mag_every", PACES)
 def test_a_turntable_after_a_rest_is_not_taken_for_a_bias(history, rate, mag_every):
     """4 minutes of it; heading error below 1 degree a minute, and in fact at any time."""

@@ -54,6 +54,7 @@ def history(filter_history):
 
 
 # -- accuracy; pytest -rP shows the figures
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [0, *EVERY])
 @pytest.mark.parametrize("name", motions.MOTIONS)
 def test_within_a_hundredth_of_a_degree_of_the_float_twin(history, name, every):

@@ -107,6 +107,7 @@ def index(tmp_path):
         server.shutdown()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mpy", [True, False], ids=["mpy", "py"])
 def test_mpremotes_mip_installs_from_the_index(index, tmp_path, mpy):
     from mpremote import mip

@@ -113,6 +113,7 @@ def test_recorded_trials_as_the_float_twin(history, recorded):
     assert twin.disagreed <= 5
 
 
+@pytest.mark.slow
 def test_recorded_trials_as_accurate_as_promised(history):
     files = recorded_trials()
     if not files or quickest() == "cpython":

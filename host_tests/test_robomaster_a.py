@@ -455,6 +455,7 @@ def iron(tmp_path):
     return path, motion
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "content, said",
     [

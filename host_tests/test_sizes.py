@@ -62,6 +62,7 @@ def test_every_board_has_its_file_system_here():
     assert set(DISKS) == boards == set(contents.ARCHITECTURES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("board", sorted(set(DISKS) - {*TOO_SMALL}))
 def test_the_default_of_a_board_fits_its_file_system_with_room_to_spare(board, fresh):
     transport = fresh(board)
