@@ -124,7 +124,7 @@ side = st.integers(-4096, 4096)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SOFTWARE)
-@settings(max_examples=15)
+@settings(max_examples=60)
 @given(side, side, side)
 @example(0, 0, -4096)
 @example(4096, 0, 0)
