@@ -1,8 +1,7 @@
 # AHRS: sensor, calibration, filter and tick as one object that a program holds; attitude and heading in degrees.
-# Needs bias.py, calibration.py, filters.py and the module of its filter, reading.py, settings.py, tick.py, timing.py.
-# Every port. Set-up and readings may allocate and use floats; what the tick runs does neither.
+# Needs bias.py, calibration.py, filters.py and the module of its filter, reading.py, settings.py, tick.py, timing.py,
+# trim.py. Every port. Set-up and readings may allocate and use floats; what the tick runs does neither.
 
-import math
 import time
 from array import array
 
@@ -555,33 +554,18 @@ class AHRS:
         for other in together:
             other._hold()
         try:
-            self._trim()
+            from upright import trim
+
+            trim.level(self.filter, self.calibration)
+            self.tick.calibrate(self.calibration)
+            self.calibration.apply(self.sensor.counts)
+            self.tick.seeded()
             if save and self.settings.CALIBRATION is not None:
                 path = self.settings.CALIBRATION
                 self.calibration.save_level(path, self.sensor.chip, self.board)
         finally:
             if self in running:
                 _run_together(together)
-
-    def _trim(self):
-        """Give the calibration the present tilt as its trim, and turn the filter with the body frame."""
-        calibration, filter = self.calibration, self.filter
-        bias = array("i", [0] * 3)
-        filter.bias(bias)
-        q = _times(filter.quaternion_floats(), _turn_of(calibration.fields.get("up_ppm"), 1))
-        w, x, y, z = q
-        up = (x * z - w * y, w * x + y * z, w * w + z * z - 0.5)  # half of it
-        before = calibration.fields.get("up_ppm")
-        calibration.set_level([round(2000000 * u) for u in up])
-        after = calibration.fields["up_ppm"]
-        filter.set_quaternion(*_times(q, _turn_of(after, -1)))
-        # the bias, from the old body frame into the new one
-        v = _turned(_turn_of(before, -1), [bias[i] for i in range(3)])
-        v = _turned(_turn_of(after, 1), v)
-        filter.set_bias(*[round(b) for b in v])
-        self.tick.calibrate(calibration)
-        calibration.apply(self.sensor.counts)
-        self.tick.seeded()
 
     def status(self):
         """A dict of names, flags and counters; docs/face.md explains each."""
@@ -775,31 +759,3 @@ def _place(ahrs):
 
 def _nothing(*_):
     pass
-
-
-# ------------------------------------------------------------------------------------ quaternions as floats: level()
-
-
-def _turn_of(up, sign):
-    """The quaternion of a trim: the shortest turn that takes `up` to z. sign -1: the opposite turn."""
-    if up is None:
-        return 1.0, 0.0, 0.0, 0.0
-    a, b, c = [u / 1000000 for u in up]
-    norm = math.sqrt(2 * (1 + c))
-    return (1 + c) / norm, sign * b / norm, -sign * a / norm, 0.0
-
-
-def _times(p, q):
-    a, b, c, d = p
-    w, x, y, z = q
-    return (
-        a * w - b * x - c * y - d * z,
-        a * x + b * w + c * z - d * y,
-        a * y - b * z + c * w + d * x,
-        a * z + b * y - c * x + d * w,
-    )
-
-
-def _turned(q, v):
-    w, x, y, z = q
-    return _times(_times(q, (0.0, v[0], v[1], v[2])), (w, -x, -y, -z))[1:]

@@ -22,7 +22,7 @@ BOXES = {
     "board": (640, 120, ["boards/*"]),
     "face": (330, 255, ["upright/__init__", "upright/ahrs", "upright/reading", "upright/settings", "upright/bias"]),
     "tick": (330, 385, ["upright/tick", "upright/timing"]),
-    "calibration": (640, 385, ["upright/calibration"]),
+    "calibration": (640, 385, ["upright/calibration", "upright/trim"]),
     "display": (640, 255, ["upright/ssd1306", "upright/canvas", "upright/font"]),
     "filters": (20, 385, ["upright/filters", "upright/attitude", "upright/fixmath", "upright/*kernels",
                           "upright/inertial", "upright/mahony", "upright/complementary", "upright/*kalman"]),
