@@ -773,3 +773,14 @@ def test_a_trim_that_would_leave_32_bits_with_its_matrix_is_refused():
     matrix = {"offset_ug": [0, 0, 0], "matrix_ppm": [1900000, 0, 0, 0, 10**6, 0, 0, 0, 10**6]}
     with pytest.raises(CalibrationError, match=r"less tilt with this accel\.matrix_ppm"):
         trimmed(30, 30, accel=matrix)
+
+
+def test_a_file_is_on_the_medium_before_it_takes_the_place_of_the_old_one(tmp_path, monkeypatch):
+    done = []
+    monkeypatch.setattr(calibration.os, "sync", lambda: done.append("sync"), raising=False)
+    rename = calibration.os.rename
+    monkeypatch.setattr(
+        calibration.os, "rename", lambda *names: (done.append("rename"), rename(*names))
+    )
+    calibration.write(str(tmp_path / "cal.json"), calibration.blank())
+    assert done == ["sync", "rename"]
