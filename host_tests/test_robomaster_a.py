@@ -459,7 +459,7 @@ def iron(tmp_path):
 @pytest.mark.parametrize(
     "content, said",
     [
-        (None, "no such file"),
+        (None, "calibration: none yet"),
         (json.dumps(calibration.blank() | {"checksum": "00000000"}), "checksum"),
         (json.dumps({"format": "recipe", "version": 1}), "not of the format"),
     ],

@@ -378,7 +378,10 @@ class AHRS:
             self.calibration.load(settings.CALIBRATION, sensor.chip, self.board)
             self.log("calibration:", settings.CALIBRATION)
         except calibrations.CalibrationError as why:
-            self.log("calibration: %s; going on with defaults" % why)
+            if why.kind == "missing":
+                self.log("calibration: none yet (%s); that is fine" % settings.CALIBRATION)
+            else:
+                self.log("calibration: %s; going on without" % why)
             self.notes.append(why.title)
 
     @property
