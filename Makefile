@@ -7,7 +7,7 @@ CHECKED = cpython unix32
 space := $() $()
 comma := ,
 
-.PHONY: setup demo check test lint bench clean
+.PHONY: setup demo check test soak lint bench clean
 
 setup:  ## .venv with .venv/bin/upright
 	@$(PYTHON) tools/bootstrap.py
@@ -23,6 +23,9 @@ test: setup lint  ## everything, on every runtime that this machine can have
 	@$(PYTHON) tools/bootstrap.py --extras
 	@$(VENV)/upright runtimes cpython unix unix32 arm
 	@$(PYTEST) --build-board $(PYTEST_ARGS)
+
+soak: setup  ## hours: the tests marked soak, with a hundred times the inputs and a day of simulated faults
+	@$(PYTEST) -m soak --soak --timeout=0 $(PYTEST_ARGS)
 
 lint: setup
 	@$(VENV)/ruff check .

@@ -67,6 +67,9 @@ def pytest_addoption(parser):
         action="store_true",
         help="build the emulated board's firmware, where there is none yet, beside the tests that do without it",
     )
+    parser.addoption(
+        "--soak", action="store_true", help="run tests marked soak at their full length"
+    )
 
 
 def pytest_configure(config):
@@ -163,6 +166,12 @@ def image():
 def version(image):
     """Of the MicroPython in `image`."""
     return rp2040.version(image)
+
+
+@pytest.fixture(scope="session")
+def soaking(request):
+    """Is this `make soak`, which has hours? For tests marked soak."""
+    return request.config.getoption("--soak")
 
 
 @pytest.fixture(autouse=True)
