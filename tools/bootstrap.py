@@ -1,4 +1,5 @@
-"""Makes .venv with everything that the host side needs: `make setup`. Standard library only, no root needed.
+"""Makes .venv with everything that the host side needs: `make setup`, or without make `python tools/bootstrap.py`.
+Standard library only, no root needed. Linux, macOS, Windows.
 
 A Debian without python3-venv has no pip to put into a virtual environment: then the wheel of Debian's python3-pip-whl
 is fetched beside it, without touching the system. `make test` also wants what tests compare with ("extras"): where a
@@ -10,16 +11,25 @@ import os
 import subprocess
 import sys
 import tempfile
-from pathlib import Path
+from pathlib import Path, PurePath, PureWindowsPath
 
 ROOT = Path(__file__).resolve().parents[1]
 VENV = ROOT / ".venv"
 STAMP = VENV / ".upright-setup"
-PYTHON = VENV / "bin" / "python"
 EXTRAS = VENV / ".upright-extras"
 CONSTRAINTS = ROOT / "tools" / "constraints.txt"
 SOURCES = (ROOT / "pyproject.toml", CONSTRAINTS, Path(__file__))
 INSTALL = ("install", "--disable-pip-version-check", "-c", str(CONSTRAINTS))
+
+
+def program(venv: PurePath, name: str) -> PurePath:
+    """Where a virtual environment has its programs."""
+    if isinstance(venv, PureWindowsPath):
+        return venv / "Scripts" / f"{name}.exe"
+    return venv / "bin" / name
+
+
+PYTHON = program(VENV, "python")
 
 
 def fail(message):
@@ -28,7 +38,7 @@ def fail(message):
 
 def stamp():
     """What the environment was made from."""
-    return "\n".join([sys.version, str(ROOT), *(source.read_text() for source in SOURCES)])
+    return "\n".join([sys.version, str(ROOT), *(source.read_text("utf-8") for source in SOURCES)])
 
 
 def pip_wheel(folder):
@@ -60,7 +70,7 @@ def make():
     has_pip = importlib.util.find_spec("ensurepip") is not None
     venv = [sys.executable, "-m", "venv", "--clear", str(VENV)]
     if subprocess.run(venv if has_pip else [*venv, "--without-pip"]).returncode:
-        fail("python3 -m venv failed, see above")
+        fail(f"{' '.join(venv)} failed, see above")
     print("setup: installing the host side's packages", flush=True)
     install = [*INSTALL, "-e", f"{ROOT}[test]"]
     with tempfile.TemporaryDirectory() as folder:
@@ -73,8 +83,9 @@ def make():
             fail("pip could not be installed, see above")
         if subprocess.run([str(PYTHON), "-m", "pip", *install], env=os.environ).returncode:
             fail("pip could not install the packages, see above")
-    STAMP.write_text(stamp())
-    print("setup: done; .venv/bin/upright --help", flush=True)
+    STAMP.write_text(stamp(), "utf-8")
+    upright = program(VENV, "upright").relative_to(ROOT)
+    print(f"setup: done; {upright} --help", flush=True)
 
 
 def add_extras():
@@ -83,7 +94,7 @@ def add_extras():
 
     print("setup: installing what the tests compare with", flush=True)
     pip = [str(PYTHON), "-m", "pip", *INSTALL, "--only-binary=:all:"]
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"][
         "optional-dependencies"
     ]
     for name in ("plot", "references", "baselines"):
@@ -93,11 +104,11 @@ def add_extras():
                 print(
                     f"setup: {package} is not available here; tests that need it skip", flush=True
                 )
-    EXTRAS.write_text(stamp())
+    EXTRAS.write_text(stamp(), "utf-8")
 
 
 if __name__ == "__main__":
-    if not STAMP.exists() or STAMP.read_text() != stamp():
+    if not STAMP.exists() or STAMP.read_text("utf-8") != stamp():
         make()
-    if "--extras" in sys.argv and (not EXTRAS.exists() or EXTRAS.read_text() != stamp()):
+    if "--extras" in sys.argv and (not EXTRAS.exists() or EXTRAS.read_text("utf-8") != stamp()):
         add_extras()

@@ -14,7 +14,7 @@ except ImportError:
 # A timer may be as inaccurate as a crystal; more would be a scale error of every angle.
 TOLERANCE_PPM = 100
 
-# Resolution of machine.Timer on each port, by sys.platform, in 1/s. linux and darwin: the simulated machine.
+# Resolution of machine.Timer on each port, by sys.platform, in 1/s. linux, darwin, win32: the simulated machine.
 PORTS = {
     "rp2": 1000000,
     "pyboard": 1000,
@@ -26,6 +26,7 @@ PORTS = {
     "zephyr": 1000,
     "linux": 1000000,
     "darwin": 1000000,
+    "win32": 1000000,
 }
 # Order in which pyb.Timers are tried: 7 has no outputs, the others few; 5 is for servos, 6 for ADC and DAC.
 _PYB_TIMERS = (7, 4, 10, 11, 13, 14, 12)

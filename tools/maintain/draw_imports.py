@@ -57,7 +57,7 @@ def box_of(name: str) -> str | None:
 def imports(path: Path) -> set[str]:
     """The names of `modules()` that a file imports from lib/upright, firmware and the tools."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.module:
             parts = node.module.split(".")
             if parts[0] == "upright":

@@ -270,7 +270,7 @@ def remarks(figures: Figures) -> Iterator[str]:
 
 def save(figures: Figures, file: Path) -> None:
     """Replace the figures in a Markdown file, between its two marks. Raises Wrong where they are missing."""
-    text = file.read_text()
+    text = file.read_text("utf-8")
     if not re.search(f"{_BEGIN}.*{_END}", text, re.DOTALL):
         raise Wrong(f"{file} has no place for the figures: {_BEGIN} ... {_END}")
     new = [_BEGIN, "", *_markdown(rows(figures)), "", *(f"- {r}" for r in remarks(figures)), ""]
@@ -279,7 +279,7 @@ def save(figures: Figures, file: Path) -> None:
         new += [f"### {title}", "", *_markdown(board_rows(figures)), ""]
     new = "\n".join([*new, _END])
     head_text, tail = text.split(_BEGIN)[0], text.split(_END)[1]
-    file.write_text(head_text + new + tail)
+    file.write_text(head_text + new + tail, encoding="utf-8")
 
 
 def _markdown(lines: Iterable[tuple[str, ...]]) -> list[str]:

@@ -138,6 +138,8 @@ app.registered_commands.sort(key=lambda command: list(_GROUPS).index(command.ric
 
 
 def main():
+    for stream in (sys.stdout, sys.stderr):
+        stream.reconfigure(errors="replace")  # Windows: a pipe does not take the display's dots
     app()
 
 

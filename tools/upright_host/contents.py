@@ -120,7 +120,7 @@ def library(text: str) -> set[str]:
     found |= packages.imports(ast.parse(text))
     for path in [*paths.FIRMWARE.glob("*.py"), *paths.APPLICATION.glob("*.py")]:
         if path.stem not in ON_DEMAND:
-            found |= packages.imports(ast.parse(path.read_text()))
+            found |= packages.imports(ast.parse(path.read_text("utf-8")))
     return with_imports(found)
 
 
@@ -131,7 +131,7 @@ def with_imports(names: set[str], late: bool = True) -> set[str]:
     """
     found, wanted = {*names}, sorted(names)
     while wanted:
-        tree = ast.parse((paths.PACKAGE / f"{wanted.pop()}.py").read_text())
+        tree = ast.parse((paths.PACKAGE / f"{wanted.pop()}.py").read_text("utf-8"))
         new = packages.imports(tree, late) - found - {*BY_HAND}
         found |= new
         wanted += sorted(new)
@@ -148,7 +148,7 @@ def setting(text: str, name: str):
 
 def platform(board: str) -> str | None:
     """The MicroPython port that a board's board.py is for (its PLATFORM), None when it says nothing."""
-    return setting((paths.BOARDS / board / "board.py").read_text(), "PLATFORM")
+    return setting((paths.BOARDS / board / "board.py").read_text("utf-8"), "PLATFORM")
 
 
 # ------------------------------------------------------------------------------------------ compiling
@@ -178,7 +178,9 @@ def find_compiler(facts: device.Facts) -> Path:
 
 def compile_module(compiler: Path, architecture: str, path: Path, small: bool = False) -> bytes:
     """-> the .mpy of a module: with line numbers, which cost 3 % and make a traceback worth having; small: without."""
-    return _compile(compiler, architecture, path.read_text(), path.name, "-O3" if small else "-O2")
+    return _compile(
+        compiler, architecture, path.read_text("utf-8"), path.name, "-O3" if small else "-O2"
+    )
 
 
 def _compile(
@@ -186,7 +188,7 @@ def _compile(
 ) -> bytes:
     with tempfile.TemporaryDirectory() as here:
         source, out = Path(here) / "in.py", Path(here) / "out.mpy"
-        source.write_text(text)
+        source.write_text(text, "utf-8")
         command = [compiler, f"-march={architecture}", level, "-s", name, "-o", out, source]
         done = subprocess.run(command, capture_output=True, text=True)
         if done.returncode:
@@ -262,7 +264,7 @@ def _unknown(module: str, name: str) -> str | None:
     if not path.exists():
         return f"there is no upright/{module}.py"
     names = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         if isinstance(node, ast.Import | ast.ImportFrom):
             names |= {alias.asname or alias.name for alias in node.names}
         elif isinstance(node, ast.ClassDef | ast.FunctionDef):
@@ -274,7 +276,7 @@ def _unknown(module: str, name: str) -> str | None:
 
 def _unknown_settings(tree: ast.Module) -> list[tuple[int, str]]:
     known = {"NAME", "PLATFORM"}
-    for node in ast.walk(ast.parse((paths.PACKAGE / "settings.py").read_text())):
+    for node in ast.walk(ast.parse((paths.PACKAGE / "settings.py").read_text("utf-8"))):
         if isinstance(node, ast.Dict):
             known |= {key.value for key in node.keys if isinstance(key, ast.Constant)}
     return [

@@ -1,7 +1,6 @@
 """Debian's packages, fetched and unpacked without touching the system or needing root. Standard library only."""
 
 import contextlib
-import fcntl
 import lzma
 import re
 import shutil
@@ -9,6 +8,8 @@ import subprocess
 import tarfile
 import tempfile
 from pathlib import Path
+
+from upright_host import lock
 
 SUITE = "trixie"  # Debian 13
 
@@ -127,8 +128,7 @@ def source(package: str, suite: str, into: Path, step=lambda percent, text: None
     """
     into = into.absolute()
     into.parent.mkdir(parents=True, exist_ok=True)
-    with open(into.parent / f".{into.name}.lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with lock.held(into.parent / f".{into.name}.lock"):
         if into.exists():
             return into
         for left in into.parent.glob(f".{into.name}-unpacking-*"):  # by a run that was killed

@@ -96,7 +96,7 @@ def _memory() -> Path:
 
 def _remembered(digest: str) -> dict:
     try:
-        kept = json.loads(_memory().read_text())
+        kept = json.loads(_memory().read_text("utf-8"))
         return kept["costs"] if kept["digest"] == digest else {}
     except (OSError, ValueError, KeyError, TypeError):
         return {}

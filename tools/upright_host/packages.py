@@ -42,7 +42,7 @@ def modules(name: str) -> list[str]:
         module = wanted.pop()
         if module not in found:
             found.add(module)
-            wanted += imports(ast.parse((paths.PACKAGE / f"{module}.py").read_text()))
+            wanted += imports(ast.parse((paths.PACKAGE / f"{module}.py").read_text("utf-8")))
             wanted += TOGETHER.get(module, ())
     return sorted(found)
 
@@ -106,14 +106,14 @@ def write_index(folder: Path) -> list[str]:
             for version in (__version__, "latest"):
                 target = folder / "package" / form / name / f"{version}.json"
                 target.parent.mkdir(parents=True, exist_ok=True)
-                target.write_text(json.dumps(entry))
+                target.write_text(json.dumps(entry), "utf-8")
     return sorted(packages)
 
 
 def _built(module: str, form: str) -> tuple[str, bytes]:
     """(file name on the board, content) of a module as source ("py") or bytecode."""
     source = paths.PACKAGE / f"{module}.py"
-    text = source.read_text()
+    text = source.read_text("utf-8")
     if form == "py" or "@micropython." in text:
         return f"upright/{source.name}", source.read_bytes()
     with tempfile.TemporaryDirectory() as here:
@@ -141,13 +141,13 @@ def register(app: typer.Typer):
             return
         wanted = package_files()
         stray = set(paths.PACKAGE.glob("*.json")) - set(wanted)
-        wrong = [p for p, text in wanted.items() if not p.exists() or p.read_text() != text]
+        wrong = [p for p, text in wanted.items() if not p.exists() or p.read_text("utf-8") != text]
         if check:
             for path in [*wrong, *stray]:
                 print(f"{path.relative_to(paths.ROOT)} is not as `upright packages` would write it")
             raise typer.Exit(1 if wrong or stray else 0)
         for path in wrong:
-            path.write_text(wanted[path])
+            path.write_text(wanted[path], "utf-8")
         for path in stray:
             path.unlink()
         print(f"{len(wanted)} package files, version {__version__}")

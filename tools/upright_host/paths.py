@@ -1,10 +1,10 @@
 """Where things are: the project's rooms, the cache, and the search path that stands in for a board's file system."""
 
 import contextlib
-import fcntl
 import os
 from pathlib import Path
 
+from upright_host import lock
 from upright_host.console import Wrong
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -31,8 +31,7 @@ def cache() -> Path:
 @contextlib.contextmanager
 def locked(name: str):
     """One process at a time fills a place of the cache."""
-    with open(cache() / f".{name}.lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with lock.held(cache() / f".{name}.lock"):
         yield
 
 

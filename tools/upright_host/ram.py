@@ -66,7 +66,7 @@ def load(transport, facts: device.Facts, *names: str):
             f"no board.py on the board that can be read ({why}): `upright flash BOARD` first"
         ) from None
     for name in names:
-        needed |= packages.imports(ast.parse((paths.APPLICATION / f"{name}.py").read_text()))
+        needed |= packages.imports(ast.parse((paths.APPLICATION / f"{name}.py").read_text("utf-8")))
     needed |= {"__init__"}
     if "doctor" in names:  # it runs the self-test
         needed |= {*contents.BY_HAND}

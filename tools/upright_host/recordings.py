@@ -115,7 +115,7 @@ def _from_csv(path: Path, rate, accel_range, gyro_range) -> Recording:
             f"no range of +-{accel_range} g and +-{gyro_range} deg/s; there are "
             f"{', '.join(map(str, sorted(lsb)))} g and {', '.join(map(str, sorted(scale)))} deg/s"
         )
-    with open(path, newline="") as file:
+    with open(path, encoding="utf-8-sig", newline="") as file:
         try:
             head, *rows = csv.reader(file)
         except (ValueError, UnicodeDecodeError, csv.Error) as why:

@@ -15,6 +15,7 @@ import signal
 import stat
 import struct
 import subprocess
+import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -26,6 +27,11 @@ from upright_host.debian import SUITE, Apt, AptError
 WHAT = "MicroPython's firmware for the Raspberry Pi Pico on an emulated RP2040"
 MINIMUM = (1, 26)  # the first whose machine.Timer has hard callbacks on this chip
 VARIABLE = "UPRIGHT_RP2040_IMAGE"
+# What a machine that cannot build it can do
+GIVEN = (
+    "download RPI_PICO's .uf2 (1.26 or newer) from micropython.org/download/RPI_PICO, then run"
+    " `upright runtimes --image FILE.uf2`"
+)
 
 _RECIPE = 1  # to be raised when the build changes: images of other recipes are not taken
 _SUITES = ("forky", "sid")  # in this order, where a MicroPython new enough is looked for
@@ -144,7 +150,7 @@ def _keep(uf2: Path, number: str, about: dict, kind: str) -> Path:
         new = Path(work) / "new"
         new.mkdir()
         shutil.copyfile(uf2, new / "firmware.uf2")
-        (new / "about.json").write_text(json.dumps(about, indent=1) + "\n")
+        (new / "about.json").write_text(json.dumps(about, indent=1) + "\n", "utf-8")
         if folder.exists():
             folder.rename(Path(work) / "old")
         new.rename(folder)
@@ -153,6 +159,8 @@ def _keep(uf2: Path, number: str, about: dict, kind: str) -> Path:
 
 # ---------------------------------------------------------------- building it
 def _build() -> Path:
+    if sys.platform != "linux":
+        raise Unavailable(f"the firmware is built on Linux only; {GIVEN}")
     place = _place()
     for left in place.glob(".building-*"):  # by a run that was killed
         shutil.rmtree(left, ignore_errors=True)
@@ -274,7 +282,7 @@ def _unpack_sources(root: Path, step) -> dict:
             said = str(why)
             continue
         # the first line: micropython (1.26.1+ds-1) unstable; urgency=medium
-        text = re.search(r"\((.*?)\)", (tree / "debian/changelog").read_text()).group(1)
+        text = re.search(r"\((.*?)\)", (tree / "debian/changelog").read_text("utf-8")).group(1)
         if tuple(int(x) for x in re.findall(r"\d+", text)[:2]) >= MINIMUM:
             found = text
             tree.rename(build / "micropython")
@@ -301,7 +309,7 @@ def _make(root: Path, enter: list[str], step) -> None:
     step(55, "compiling mpy-cross")
     log = paths.cache() / "rp2040-build.log"
     with (
-        open(log, "w") as out,
+        open(log, "w", encoding="utf-8") as out,
         subprocess.Popen(
             [*enter, "/usr/bin/env", "-i", *inside, "/bin/sh", "/build/build.sh"],
             env=_host_environment(),
@@ -325,7 +333,7 @@ def _make(root: Path, enter: list[str], step) -> None:
     if make.returncode:
         lines = [
             line
-            for line in log.read_text().splitlines()
+            for line in log.read_text("utf-8").splitlines()
             if re.search(r"\b(error|Error|undefined)\b", line)
         ]
         raise Unavailable(
@@ -336,7 +344,7 @@ def _make(root: Path, enter: list[str], step) -> None:
 
 def _released(root: Path) -> int:
     """When this MicroPython was packaged, seconds since 1970: the date in the image, so that each build is the same."""
-    changelog = (root / "build/micropython/debian/changelog").read_text()
+    changelog = (root / "build/micropython/debian/changelog").read_text("utf-8")
     date = re.search(r"^ -- .*>  (.*)$", changelog, re.MULTILINE).group(1)
     return int(email.utils.parsedate_to_datetime(date).timestamp())
 

@@ -244,7 +244,8 @@ def command(
     environment = dict(os.environ)
     if name == "cpython":
         folders = [paths.SHIM, *folders]
-        environment["PYTHONPATH"] = ":".join(map(str, folders))
+        environment["PYTHONUTF8"] = "1"
+        environment["PYTHONPATH"] = os.pathsep.join(map(str, folders))
         # The shim prepares `time`: it has to come before the script, whose first import may be time.
         launch = (
             "import micropython, runpy, sys; sys.argv = sys.argv[1:];"

@@ -46,14 +46,14 @@ def run(runtime: str, script: Path, config: dict, on_event=None, flash: Path | N
             runtime, script, [told], config.get("board_name", "sim")
         )
         with (
-            open(Path(folder) / "errors", "w+") as errors,
+            open(Path(folder) / "errors", "w+", encoding="utf-8") as errors,
             subprocess.Popen(
                 argv,
                 env=environment,
                 cwd=flash or folder,
                 stdout=subprocess.PIPE,
                 stderr=errors,
-                text=True,
+                encoding="utf-8",
                 bufsize=1,
             ) as process,
         ):

@@ -58,7 +58,7 @@ def marks(
     traced = [qemu, _one_by_one(qemu), "-d", "exec,nochain", "-D", "/dev/stdout", *rest]
     found = []
     with (
-        tempfile.TemporaryFile("w+") as errors,
+        tempfile.TemporaryFile("w+", encoding="utf-8") as errors,
         subprocess.Popen(traced, env=environment, stdout=subprocess.PIPE, stderr=errors) as process,
     ):
         try:

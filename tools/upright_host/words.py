@@ -385,7 +385,7 @@ def unused() -> list[str]:
             modules.append("earth_kernels")
         if name in ("euler", "kalman"):
             modules += ["euler_kernels", "complementary"]
-        text = "".join((paths.PACKAGE / f"{module}.py").read_text() for module in modules)
+        text = "".join((paths.PACKAGE / f"{module}.py").read_text("utf-8") for module in modules)
         lines += [f"{name}.{word}" for word in words if not re.search(rf"\b_{word}\b", text)]
     return lines
 
@@ -395,12 +395,12 @@ def main(arguments: list[str]) -> int:
     stale = []
     for module in MODULES:
         path = paths.PACKAGE / f"{module}.py"
-        text = path.read_text()
+        text = path.read_text("utf-8")
         new = written(text, module)
         if new != text:
             stale.append(path.name)
             if "--check" not in arguments:
-                path.write_text(new)
+                path.write_text(new, "utf-8")
     print("words: " + (", ".join(stale) if stale else "all as in the tables"))
     return int(bool(stale) and "--check" in arguments)
 
