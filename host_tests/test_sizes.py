@@ -10,8 +10,12 @@ from upright_host import __version__, contents, device, flash, paths
 # tables of the ports; robomaster_a: ours.
 DISKS = {
     "esp32": ("VfsLfs2", 4096, 512),
+    "esp32_c3": ("VfsLfs2", 4096, 512),
+    "esp32_s3": ("VfsLfs2", 4096, 512),
     "pico": ("VfsLfs2", 4096, 352),
     "pico2": ("VfsLfs2", 4096, 640),
+    "pico2_w": ("VfsLfs2", 4096, 640),
+    "pico_w": ("VfsLfs2", 4096, 212),
     "pyboard": ("VfsFat", 512, 224),
     "robomaster_a": ("VfsFat", 512, 512),
     "weact_f411_blackpill": ("VfsFat", 512, 128),

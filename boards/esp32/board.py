@@ -7,12 +7,13 @@ from upright.mpu6050 import MPU6050
 
 NAME = "ESP32"
 PLATFORM = "esp32"  # sys.platform there
-SENSOR_RATE_HZ = 1000
 
-# A stuck bus blocks a tick for this long at most (us).
-_TIMEOUT_US = 3000
+_HZ = 400000
+# A stuck bus blocks a tick for this long at most (us). This port counts in ticks of 10 ms: below 20 ms every transfer
+# may fail (ESP-IDF 5.5.2 and newer).
+_TIMEOUT_US = 20000
 
-_i2c = I2C(0, scl=Pin(22), sda=Pin(21), freq=400000, timeout=_TIMEOUT_US)
+_i2c = I2C(0, scl=Pin(22), sda=Pin(21), freq=_HZ, timeout=_TIMEOUT_US)
 
 
 def sensor():

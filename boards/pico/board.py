@@ -9,10 +9,11 @@ NAME = "Raspberry Pi Pico"
 PLATFORM = "rp2"  # sys.platform there
 SENSOR_RATE_HZ = 1000
 
-# A stuck bus blocks a tick for this long at most (us).
-_TIMEOUT_US = 3000
+_HZ = 400000
+# A stuck bus blocks a tick for this long at most (us). The longest transfer, 120 bytes of the FIFO, has to fit in.
+_TIMEOUT_US = 1000 + 9 * 120 * 1000000 // _HZ
 
-_i2c = I2C(0, scl=Pin(5), sda=Pin(4), freq=400000, timeout=_TIMEOUT_US)
+_i2c = I2C(0, scl=Pin(5), sda=Pin(4), freq=_HZ, timeout=_TIMEOUT_US)
 
 
 def sensor():

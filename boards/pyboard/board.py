@@ -9,10 +9,12 @@ NAME = "Pyboard"
 PLATFORM = "pyboard"  # sys.platform there
 SENSOR_RATE_HZ = 1000
 
-# A stuck bus blocks a tick for this long at most (us, whole milliseconds on this port).
-_TIMEOUT_US = 3000
+_HZ = 400000
+# A stuck bus blocks a tick for this long at most (us; this port rounds up to ms). The longest transfer, 120 bytes of
+# the FIFO, has to fit in.
+_TIMEOUT_US = 1000 + 9 * 120 * 1000000 // _HZ
 
-_i2c = I2C(1, freq=400000, timeout=_TIMEOUT_US)  # X9, X10
+_i2c = I2C(1, freq=_HZ, timeout=_TIMEOUT_US)  # X9, X10
 
 
 def sensor():

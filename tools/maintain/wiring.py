@@ -15,31 +15,30 @@ _SIGNALS = {
     "SCL": ("#b7950b", "SCL", "SCL"),
     "INT": ("#7d8a8f", "INT", None),
 }
+_PICO = {
+    "3V3": "3V3(OUT), pin 36",
+    "GND": "GND, pin 38",
+    "SDA": "GP4, pin 6",
+    "SCL": "GP5, pin 7",
+    "INT": "GP6, pin 9",
+}
 # folder: (name, {signal: what is printed at the board's pin})
 BOARDS = {
-    "pico": (
-        "Raspberry Pi Pico",
-        {
-            "3V3": "3V3(OUT), pin 36",
-            "GND": "GND, pin 38",
-            "SDA": "GP4, pin 6",
-            "SCL": "GP5, pin 7",
-            "INT": "GP6, pin 9",
-        },
-    ),
-    "pico2": (
-        "Raspberry Pi Pico 2",
-        {
-            "3V3": "3V3(OUT), pin 36",
-            "GND": "GND, pin 38",
-            "SDA": "GP4, pin 6",
-            "SCL": "GP5, pin 7",
-            "INT": "GP6, pin 9",
-        },
-    ),
+    "pico": ("Raspberry Pi Pico", _PICO),
+    "pico_w": ("Raspberry Pi Pico W", _PICO),
+    "pico2": ("Raspberry Pi Pico 2", _PICO),
+    "pico2_w": ("Raspberry Pi Pico 2 W", _PICO),
     "esp32": (
         "ESP32 DevKitC",
         {"3V3": "3V3", "GND": "GND", "SDA": "IO21", "SCL": "IO22", "INT": "IO19"},
+    ),
+    "esp32_s3": (
+        "ESP32-S3",
+        {"3V3": "3V3", "GND": "GND", "SDA": "GPIO8", "SCL": "GPIO9", "INT": "GPIO4"},
+    ),
+    "esp32_c3": (
+        "ESP32-C3",
+        {"3V3": "3V3", "GND": "GND", "SDA": "GPIO6", "SCL": "GPIO7", "INT": "GPIO10"},
     ),
     "pyboard": (
         "Pyboard",

@@ -9,8 +9,12 @@ from chips.ssd1306 import SSD1306Chip
 _I2C = {
     "sim": (0, 5, 4, 6),
     "pico": (0, 5, 4, 6),
+    "pico_w": (0, 5, 4, 6),
     "pico2": (0, 5, 4, 6),
+    "pico2_w": (0, 5, 4, 6),
     "esp32": (0, 22, 21, 19),
+    "esp32_s3": (0, 9, 8, 4),
+    "esp32_c3": (0, 7, 6, 10),
     "pyboard": (1, "X9", "X10", "X1"),
     "weact_f411_blackpill": (1, "PB6", "PB7", "PB0"),
 }

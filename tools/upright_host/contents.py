@@ -15,8 +15,12 @@ BY_HAND = ("mpu_selftest",)
 # The boards of boards/ and their processors' native code, as mpy-cross calls it
 ARCHITECTURES = {
     "esp32": "xtensawin",
+    "esp32_c3": "rv32imc",
+    "esp32_s3": "xtensawin",
     "pico": "armv6m",
     "pico2": "armv7emsp",
+    "pico2_w": "armv7emsp",
+    "pico_w": "armv6m",
     "pyboard": "armv7emsp",
     "robomaster_a": "armv7emsp",
     "weact_f411_blackpill": "armv7emsp",
