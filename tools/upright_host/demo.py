@@ -19,7 +19,6 @@ from upright_host import (
     library,
     oled,
     options,
-    paths,
     registry,
     replay,
     runtimes,
@@ -282,6 +281,7 @@ def register(app: typer.Typer) -> None:
         motion: str = typer.Option("demo", help="Synthetic motion, when there is no --trial."),
         board: str = typer.Option(
             None,
+            callback=options.simulated_board,
             help="The board to simulate, a folder of boards/ (sim; with nine axes robomaster_a).",
         ),
         filters: str = typer.Option(
@@ -303,7 +303,7 @@ def register(app: typer.Typer) -> None:
         """Boot the firmware on a simulated board: MPU6050, filter in a hard timer tick, OLED; how far off it was."""
         names = registry.listed(filters) if filters else [None]
         nine = next((name for name in names if name and registry.axes(name) == 9), None)
-        board = paths.known_board(board or (replay.board_for(nine) if nine else "sim"))
+        board = board or (replay.board_for(nine) if nine else "sim")
         if trial and "dmp6" in names:
             raise Wrong("dmp6 samples by a clock of its own: it cannot follow a --trial")
         source = (

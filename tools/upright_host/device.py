@@ -5,12 +5,16 @@ Stands on mpremote's transports; whatever has their interface will do (the emula
 
 import ast
 import contextlib
+import os
+import stat
+import sys
 import time
 from dataclasses import dataclass
 
-from upright_host.console import Failed
+from upright_host.console import Failed, Wrong
 
 LEAST_VERSION = (1, 22)
+_AFTER_LAST_S = 0.5  # a picture of the display is written meanwhile
 # sys.implementation._mpy >> 10 & 15 (MicroPython's docs, reference/mpyfiles; flags of the architecture stand above)
 _ARCHITECTURES = (
     *("", "x86", "x64", "armv6", "armv6m", "armv7m", "armv7em", "armv7emsp", "armv7emdp"),
@@ -99,7 +103,7 @@ def pick_port(wanted: str | None) -> str:
     if not found:
         raise DeviceError(
             "no board found on USB. Is the cable one with data lines? Does the board run MicroPython (see its README in"
-            " boards/)? On Linux, are you in the group dialout? --port names one outright"
+            " boards/)? A container or virtual machine has to be given the port. --port names one outright"
         )
     if len(found) > 1:
         listed = "\n".join(f"  --port {device}   {what}" for device, what in found)
@@ -108,24 +112,79 @@ def pick_port(wanted: str | None) -> str:
 
 
 def connect(port: str):
-    """A mpremote transport to the board on a port, its program stopped and the raw REPL entered."""
+    """A mpremote transport to the board on a port, its program stopped and the raw REPL entered.
+
+    Raises Wrong where there is no such port, DeviceError where it cannot be used.
+    """
     from mpremote.transport import TransportError
     from mpremote.transport_serial import SerialTransport
 
+    if "://" not in port:  # else one of pyserial's addresses, as rfc2217://HOST:PORT
+        _look_at(port)
     try:
         transport = SerialTransport(port)
+    except (TransportError, OSError, ValueError) as why:
+        raise DeviceError(
+            f"{port} cannot be opened ({why}). Is another program (a terminal, an editor) using it?"
+        ) from why
+    try:
         transport.enter_raw_repl(soft_reset=True)
     except (TransportError, OSError) as why:
+        transport.close()
         raise DeviceError(
-            f"{port}: {why}. Is another program (a terminal, an editor) using the port? If not, press the board's reset"
+            f"{port} is there, but MicroPython's prompt does not answer ({why}). Press the board's reset and try again."
+            " Does the board run MicroPython (see its README in boards/)?"
         ) from why
     return transport
+
+
+def _look_at(port: str) -> None:
+    """Refuse a port that is not there, or not for this user: pyserial says the same of both."""
+    found = [device for device, _ in ports()]
+    listed = f"there is {', '.join(found)}" if found else "no board is on USB"
+    if os.name == "nt":
+        if port.upper() not in {device.upper() for device in _all_ports()}:
+            raise Wrong(f"there is no port {port}; {listed}")
+        return
+    try:
+        about = os.stat(port)
+    except OSError as why:
+        raise Wrong(f"there is no port {port} ({why.strerror}); {listed}") from None
+    if not stat.S_ISCHR(about.st_mode):
+        raise Wrong(f"{port} is no serial port; {listed}")
+    if not os.access(port, os.R_OK | os.W_OK):
+        raise DeviceError(f"{port}: permission denied. {_group_hint(about.st_gid)}")
+
+
+def _all_ports() -> list[str]:
+    from serial.tools import list_ports
+
+    return [port.device for port in list_ports.comports()]
+
+
+def _group_hint(gid: int) -> str:
+    """How an ordinary user gets at a port of this group."""
+    if sys.platform != "linux":
+        return "It belongs to another user"
+    import grp
+
+    try:
+        group = grp.getgrgid(gid).gr_name
+    except KeyError:
+        group = "dialout"
+    if group == "root":  # its udev rule gives it to nobody: the usual group will not do
+        return "It belongs to root alone: a udev rule has to give it to your group"
+    return (
+        f"Your user is not in the group {group}: `sudo usermod -aG {group} $USER`, then log out and in again"
+        f" (or, for this terminal, `newgrp {group}`)"
+    )
 
 
 @contextlib.contextmanager
 def opened(port: str | None, emulated: bool = False):
     """A transport to the emulated Pico, or to the board on a port: this one, or the only one. Raises DeviceError."""
     from mpremote.transport import TransportError
+    from serial import SerialException
 
     if emulated:
         from upright_host import emulated as pico
@@ -137,8 +196,11 @@ def opened(port: str | None, emulated: bool = False):
         yield transport
     except TransportError as why:
         raise DeviceError(str(why)) from None
+    except SerialException as why:
+        raise DeviceError(f"the line to the board broke off ({why}). Is it plugged in?") from None
     finally:
-        transport.close()
+        with contextlib.suppress(SerialException):
+            transport.close()
 
 
 def facts(transport) -> Facts:
@@ -160,20 +222,30 @@ def space(transport) -> tuple[int, int]:
     return status[0], status[0] * status[3]
 
 
-def restart(transport, seconds: float, on_line):
-    """Soft-reset the board and pass on what it prints for a while, line by line.
+def restart(transport, seconds: float, on_line, is_last=lambda line: False) -> bool:
+    """Soft-reset the board and pass on what it prints for a while, line by line -> whether is_last(line) was true of
+    one, half a second after which it ends.
 
     A transport whose board does not live in the host's time has a `clock` of its own.
     """
     line, clock = transport.serial, getattr(transport, "clock", time)
     transport.exit_raw_repl()
     line.write(b"\x04")
-    end, rest = clock.monotonic() + seconds, b""
+    end, rest, done = clock.monotonic() + seconds, b"", False
+
+    def take(text):
+        nonlocal done, end
+        text = text.decode("utf-8", "replace").rstrip("\r")
+        on_line(text)
+        if not done and is_last(text):
+            done, end = True, clock.monotonic() + _AFTER_LAST_S
+
     while clock.monotonic() < end:
         clock.sleep(0.02)
         rest += line.read(line.inWaiting() or 0)
         *whole, rest = rest.split(b"\n")
         for text in whole:
-            on_line(text.decode("utf-8", "replace").rstrip("\r"))
+            take(text)
     if rest:
-        on_line(rest.decode("utf-8", "replace").rstrip("\r"))
+        take(rest)
+    return done

@@ -7,7 +7,7 @@ import ast
 
 import typer
 
-from upright_host import contents, device, paths, ram, simulate
+from upright_host import contents, device, options, paths, ram, simulate
 from upright_host.console import FAILED, Wrong, say
 
 DOCTOR = paths.SIMULATOR / "run_doctor.py"
@@ -66,7 +66,7 @@ def examine_simulated(board: str, runtime: str, on_line, **parts) -> list[str]:
     result = simulate.run(
         runtime,
         DOCTOR,
-        {"board_name": paths.known_board(board)} | parts,
+        {"board_name": board} | parts,
         lambda kind, fields: on_line(fields[0]) if kind == "console" else None,
     )
     return result["problems"]
@@ -87,7 +87,9 @@ def register(app: typer.Typer):
             False, "--south", help="With --axes: on the southern half of the earth."
         ),
         simulated: str = typer.Option(
-            None, help="Examine this simulated board, a folder of boards/."
+            None,
+            callback=options.simulated_board,
+            help="Examine this simulated board, a folder of boards/.",
         ),
         emulated: bool = typer.Option(
             False,

@@ -17,7 +17,7 @@ from pathlib import PurePosixPath
 import typer
 from mpremote.transport import TransportExecError
 
-from upright_host import __version__, contents, device, options, paths
+from upright_host import __version__, console, contents, device, oled, options, paths
 from upright_host.console import Wrong, progress, say
 
 RECORD = "upright.json"  # on the board: what was installed, {"version": , "files": {name: sha256}}
@@ -509,6 +509,33 @@ def run(transport, board: str, source: bool, force: bool, everything: bool = Fal
     return True
 
 
+def show_start(transport, seconds: float | None, emulated: bool = False) -> None:
+    """Restart the board and show what it says, for so long; without a time until the tick runs, or until it had time
+    enough."""
+    say("restarting:")
+    told = seconds is not None
+    runs = device.restart(
+        transport,
+        seconds if told else 6 if emulated else 10,
+        lambda line: say("  " + line),
+        lambda line: line.startswith("tick: ") and not told,
+    )
+    if runs and emulated:
+        console.out.print(
+            oled.panel(transport.board.display.picture(), console.out.width, title="128x64 OLED")
+        )
+    if runs:
+        say(
+            "It works: the tick runs, and the display shows roll, pitch and yaw."
+            f" `upright doctor{' --emulated' if emulated else ''}` examines the board"
+        )
+    elif not told:
+        say(
+            "No tick yet. The lines above say why (a main.py of your own may say nothing); `upright doctor` examines"
+            " the board"
+        )
+
+
 def _own(transport) -> str:
     """The text of the user's board.py and main.py that are on the board, where they are Python."""
     texts = []
@@ -543,7 +570,7 @@ def register(app: typer.Typer):
             help="Replace files of your own that are in the way; a copy stays as NAME.bak.",
         ),
         seconds: float = options.seconds(
-            "Show what the board says after its restart for so long (default: 5, emulated 2)."
+            "Show what the board says after its restart for so long (default: until its tick runs)."
         ),
         emulated: bool = typer.Option(
             False,
@@ -553,11 +580,12 @@ def register(app: typer.Typer):
     ):
         """Install the firmware on a board over USB: compiled for it, only what changed, verified, never half."""
         paths.known_board(board)
+        if board == "sim":
+            raise Wrong(
+                "sim is the simulated board of `upright demo`: name the board that you have"
+            )
         if emulated and board != "pico":
             raise Wrong(f"the emulated board is a Pico, not {board}")
         with device.opened(port, emulated) as transport:
             run(transport, board, source, force, everything)
-            say("restarting:")
-            device.restart(
-                transport, seconds or (2 if emulated else 5), lambda line: say("  " + line)
-            )
+            show_start(transport, seconds, emulated)

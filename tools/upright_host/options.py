@@ -5,7 +5,7 @@ from pathlib import Path
 
 import typer
 
-from upright_host import runtimes
+from upright_host import library, paths, runtimes
 from upright_host.console import Wrong
 
 
@@ -26,6 +26,15 @@ def runtime(default: str | None = None, board: bool = False, help: str = ""):
         return name
 
     return typer.Option(default, "--runtime", callback=known, help=f"{help}{said}.")
+
+
+def simulated_board(name: str | None):
+    """-> the name. Raises Wrong where boards/ has no folder of it, or the simulator no chips."""
+    if name is not None and paths.known_board(name) not in library.simulator("boards").BOARDS:
+        raise Wrong(
+            f"boards/{name} has no simulated chips: add a line to tools/simulator/boards.py"
+        )
+    return name
 
 
 def jobs(what: str):

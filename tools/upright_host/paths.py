@@ -1,6 +1,7 @@
 """Where things are: the project's rooms, the cache, and the search path that stands in for a board's file system."""
 
 import contextlib
+import difflib
 import os
 from pathlib import Path
 
@@ -43,8 +44,23 @@ def boards() -> list[str]:
 def known_board(name: str) -> str:
     """-> the name. Raises Wrong where boards/ has no folder of it."""
     if name not in boards():
-        raise Wrong(f"unknown board {name!r}; there are {', '.join(boards())}")
+        near = nearest_board(name)
+        guess = f". Did you mean {near}? There" if near else "; there"
+        raise Wrong(
+            f"unknown board {name!r}{guess} are {', '.join(boards())}. `upright board new NAME` makes another"
+        )
     return name
+
+
+def nearest_board(name: str) -> str | None:
+    """The folder of boards/ that a name most likely means: "picow", "ESP32-C3"."""
+
+    def plain(text):
+        return "".join(c for c in text.lower() if c.isalnum())
+
+    known = {plain(board): board for board in boards()}
+    near = difflib.get_close_matches(plain(name), known, 1, 0.7)
+    return known[near[0]] if near else None
 
 
 def board_path(board: str = "sim", simulated: bool = True) -> list[Path]:

@@ -29,7 +29,7 @@ MINIMUM = (1, 26)  # the first whose machine.Timer has hard callbacks on this ch
 VARIABLE = "UPRIGHT_RP2040_IMAGE"
 # What a machine that cannot build it can do
 GIVEN = (
-    "download RPI_PICO's .uf2 (1.26 or newer) from micropython.org/download/RPI_PICO, then run"
+    "To take a finished one: download RPI_PICO's .uf2 (1.26 or newer) from micropython.org/download/RPI_PICO, then run"
     " `upright runtimes --image FILE.uf2`"
 )
 
@@ -160,7 +160,14 @@ def _keep(uf2: Path, number: str, about: dict, kind: str) -> Path:
 # ---------------------------------------------------------------- building it
 def _build() -> Path:
     if sys.platform != "linux":
-        raise Unavailable(f"the firmware is built on Linux only; {GIVEN}")
+        raise Unavailable(f"the firmware is built on Linux only. {GIVEN}")
+    try:
+        return _build_here()
+    except Unavailable as why:
+        raise Unavailable(f"{why}. {GIVEN}") from None
+
+
+def _build_here() -> Path:
     place = _place()
     for left in place.glob(".building-*"):  # by a run that was killed
         shutil.rmtree(left, ignore_errors=True)
@@ -228,9 +235,7 @@ def _way_in(root: Path) -> list[str]:
             os.mknod(root / "dev/null", stat.S_IFCHR | 0o666, os.makedev(1, 3))
             return ["chroot", str(root)]
     why = (said or ["refused"])[-1]
-    raise Unavailable(
-        f"building the firmware needs root or user namespaces ({why}); {VARIABLE} can name a finished image"
-    )
+    raise Unavailable(f"building the firmware needs root or user namespaces ({why})")
 
 
 def _host_environment() -> dict:

