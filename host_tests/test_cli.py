@@ -4,9 +4,10 @@ import re
 
 import numpy as np
 import pytest
+import typer
 from PIL import Image
 from trial_files import save
-from upright_host import replay, runtimes, scoring, simulate
+from upright_host import console, replay, runtimes, scoring, simulate
 
 
 @pytest.fixture(scope="module")
@@ -245,3 +246,11 @@ def test_the_demo_takes_the_board_that_a_filter_needs_and_refuses_an_unknown_one
     assert "robomaster_a" in done.output
     assert replay.board_for("inertial9-lite") == "robomaster_a"
     assert replay.board_for("inertial6") == "sim"
+
+
+def test_what_a_damaged_file_brings_into_a_message_neither_fills_nor_upsets_the_terminal(capsys):
+    with pytest.raises(typer.Exit):
+        console.fail("a: " + "x" * 5000 + "\x1b[31m\r" + "y" * 60, console.WRONG)
+    said = capsys.readouterr().err.rstrip("\n")
+    assert len(said) < 700 and said.startswith("a: xxx") and said.endswith("yyy")
+    assert said.isprintable()

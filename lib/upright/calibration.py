@@ -405,7 +405,10 @@ def _parse(path, data):
         )
     found = fields.pop("checksum", None)
     _check_shape(fields, path)
-    body = _text(fields)
+    try:
+        body = _text(fields)
+    except ValueError:  # a name with half of a surrogate pair, which a host does not encode
+        raise CalibrationError("corrupt", "%s: chip or board is no text" % path)
     wanted = "%08x" % crc32(body)
     if found != wanted:
         raise CalibrationError(

@@ -21,6 +21,8 @@ EXIT_CODES = (
     " package is not here."
 )
 
+_LINE_MOST = 600
+
 out = Console()
 errors = Console(stderr=True)
 
@@ -70,8 +72,12 @@ def failing():
 
 
 def fail(message: str, code: int):
-    """Say it in red and end the command."""
-    say(message, "red", errors)
+    """Say it in red and end the command. What a damaged file brought into it neither fills nor upsets the terminal."""
+    for line in message.split("\n"):
+        line = "".join(c if c.isprintable() else "?" for c in line)
+        if len(line) > _LINE_MOST:
+            line = f"{line[: _LINE_MOST * 2 // 3]} ... {line[-_LINE_MOST // 3 :]}"
+        say(line, "red", errors)
     raise typer.Exit(code) from None
 
 

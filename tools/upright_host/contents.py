@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import tempfile
+import warnings
 import zlib
 from pathlib import Path
 
@@ -118,13 +119,14 @@ def library(text: str) -> set[str]:
     default = "inertial9" if "def magnetometer(" in text else "inertial6"
     try:
         chosen = setting(text, "FILTER")
-        found = {"__init__", module[chosen if chosen in module else default]}
+        known = isinstance(chosen, str) and chosen in module
+        found = {"__init__", module[chosen if known else default]}
     except ValueError:
         found = {"__init__", *module.values()}
-    found |= packages.imports(ast.parse(text))
+    found |= packages.imports(parse(text))
     for path in [*paths.FIRMWARE.glob("*.py"), *paths.APPLICATION.glob("*.py")]:
         if path.stem not in ON_DEMAND:
-            found |= packages.imports(ast.parse(path.read_text("utf-8")))
+            found |= packages.imports(packages.tree(path))
     return with_imports(found)
 
 
@@ -135,16 +137,30 @@ def with_imports(names: set[str], late: bool = True) -> set[str]:
     """
     found, wanted = {*names}, sorted(names)
     while wanted:
-        tree = ast.parse((paths.PACKAGE / f"{wanted.pop()}.py").read_text("utf-8"))
+        tree = packages.tree(paths.PACKAGE / f"{wanted.pop()}.py")
         new = packages.imports(tree, late) - found - {*BY_HAND}
         found |= new
         wanted += sorted(new)
     return found
 
 
+def parse(text: str) -> ast.Module:
+    """The syntax tree of a program of the user's, without warnings about it. Raises SyntaxError, whatever is wrong."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return ast.parse(text)
+    except (ValueError, RecursionError, MemoryError) as why:  # a zero byte, a thousand brackets
+        raise SyntaxError(str(why) or "too deeply nested", ("", 1, 0, "")) from None
+
+
 def setting(text: str, name: str):
     """What a file of Python sets a name to, None when it does not. Raises ValueError when that is no constant."""
-    for node in ast.parse(text).body:
+    try:
+        tree = parse(text)
+    except SyntaxError as why:
+        raise ValueError(f"line {why.lineno}: {why.msg}") from None
+    for node in tree.body:
         if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == name:
             return ast.literal_eval(node.value)
     return None
@@ -214,7 +230,7 @@ def lines_to_change(text: str, gone: set[str], board: bool = False) -> list[str]
     use of Upright is looked through as well.
     """
     try:
-        tree = ast.parse(text)
+        tree = parse(text)
     except SyntaxError as why:
         return [f"line {why.lineno}: {why.msg}"] if board else []
     lines, said, modules = text.splitlines(), [], {}
@@ -272,7 +288,7 @@ def _unknown(module: str, name: str) -> str | None:
     if not path.exists():
         return f"there is no upright/{module}.py"
     names = set()
-    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+    for node in ast.walk(packages.tree(path)):
         if isinstance(node, ast.Import | ast.ImportFrom):
             names |= {alias.asname or alias.name for alias in node.names}
         elif isinstance(node, ast.ClassDef | ast.FunctionDef):
@@ -284,7 +300,7 @@ def _unknown(module: str, name: str) -> str | None:
 
 def _unknown_settings(tree: ast.Module) -> list[tuple[int, str]]:
     known = {"NAME", "PLATFORM"}
-    for node in ast.walk(ast.parse((paths.PACKAGE / "settings.py").read_text("utf-8"))):
+    for node in ast.walk(packages.tree(paths.PACKAGE / "settings.py")):
         if isinstance(node, ast.Dict):
             known |= {key.value for key in node.keys if isinstance(key, ast.Constant)}
     return [

@@ -253,7 +253,7 @@ def _finish(transport) -> set[str]:
     _finish_older(transport)
     try:
         text = transport.fs_readfile(SELF).decode()
-        call = ast.parse(text).body[-1].value
+        call = contents.parse(text).body[-1].value
         names = {*ast.literal_eval(call.args[0]), SELF}
         what = call.func.id
     except (OSError, ValueError, SyntaxError, IndexError, AttributeError, TypeError):
@@ -542,7 +542,7 @@ def _own(transport) -> str:
     for name in KEPT:
         try:
             text = transport.fs_readfile(name).decode()
-            ast.parse(text)
+            contents.parse(text)
             texts.append(text)
         except (OSError, ValueError, SyntaxError):
             pass

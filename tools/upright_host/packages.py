@@ -6,6 +6,7 @@ module, github:ORG/REPO for all. The version is the project's, for all of them.
 """
 
 import ast
+import functools
 import hashlib
 import json
 import subprocess
@@ -42,9 +43,15 @@ def modules(name: str) -> list[str]:
         module = wanted.pop()
         if module not in found:
             found.add(module)
-            wanted += imports(ast.parse((paths.PACKAGE / f"{module}.py").read_text("utf-8")))
+            wanted += imports(tree(paths.PACKAGE / f"{module}.py"))
             wanted += TOGETHER.get(module, ())
     return sorted(found)
+
+
+@functools.cache
+def tree(path: Path) -> ast.Module:
+    """The syntax tree of a module of the project's."""
+    return ast.parse(path.read_text("utf-8"))
 
 
 def imports(tree: ast.Module, late: bool = True) -> set[str]:

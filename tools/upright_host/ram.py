@@ -4,7 +4,6 @@ The compiled modules go over the raw prompt into a file system that is a diction
 lasts. Modules of lib/upright that the board lacks go with them.
 """
 
-import ast
 import base64
 
 from upright_host import contents, device, flash, packages, paths
@@ -60,13 +59,13 @@ def load(transport, facts: device.Facts, *names: str):
     """
     try:
         text = transport.fs_readfile("board.py").decode()
-        needed = packages.imports(ast.parse(text))
+        needed = packages.imports(contents.parse(text))
     except (OSError, ValueError, SyntaxError) as why:
         raise device.DeviceError(
             f"no board.py on the board that can be read ({why}): `upright flash BOARD` first"
         ) from None
     for name in names:
-        needed |= packages.imports(ast.parse((paths.APPLICATION / f"{name}.py").read_text("utf-8")))
+        needed |= packages.imports(packages.tree(paths.APPLICATION / f"{name}.py"))
     needed |= {"__init__"}
     if "doctor" in names:  # it runs the self-test
         needed |= {*contents.BY_HAND}

@@ -1,6 +1,7 @@
 """Recordings of a board's counts: `.imu` as the board writes them, `.npz` (a trial), `.csv`."""
 
 import csv
+import fractions
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,10 +92,17 @@ def _from_imu(path: Path) -> Recording:
     except ValueError as why:
         raise Wrong(str(why)) from why
     held.close()
+    if not 1e-3 <= fractions.Fraction(*held.rate) <= 1e6:
+        raise Wrong(f"{path}: a rate of {held.rate[0]}/{held.rate[1]} Hz is none")
     data = path.read_bytes()
     end = data.index(b"\n")
     more = json.loads(data[:end])  # what a board that recorded it says besides
     scale = more.get("mag_lsb_per_uT")
+    if scale is not None and not _is_ratio(scale):
+        raise Wrong(f"{path}: mag_lsb_per_uT is {scale!r}, expected two positive numbers")
+    for name in ("chip", "board"):
+        if not isinstance(more.get(name, ""), str | None):
+            raise Wrong(f"{path}: {name} is {more[name]!r}, expected a name")
     return Recording(
         path.name,
         np.frombuffer(data, "<i2", offset=end + 1).reshape(-1, 11).astype(np.int64),
@@ -104,6 +112,14 @@ def _from_imu(path: Path) -> Recording:
         scale[0] / scale[1] if scale else None,
         more.get("chip"),
         more.get("board"),
+    )
+
+
+def _is_ratio(pair) -> bool:
+    return (
+        isinstance(pair, list)
+        and len(pair) == 2
+        and all(type(number) is int and 0 < number < 2**31 for number in pair)
     )
 
 
@@ -132,7 +148,7 @@ def _from_csv(path: Path, rate, accel_range, gyro_range) -> Recording:
                     counts[i, COLUMNS.index(name)] = int(text)
                 elif name == "t":
                     times.append(float(text))
-        except ValueError as why:
+        except (ValueError, OverflowError) as why:
             raise Wrong(f"{path}, line {i + 2}: {why}; expected whole counts") from why
     if not len(rows) or np.abs(counts).max() > 32768:
         raise Wrong(f"{path}: no rows, or counts beyond 16 bits")

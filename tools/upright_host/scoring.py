@@ -159,7 +159,7 @@ def read_csv(path) -> tuple[np.ndarray, np.ndarray]:
                 row = [float(field) for field in line.split(",")]
             except ValueError:
                 row = []
-            if len(row) != 5:
+            if len(row) != 5 or not all(map(math.isfinite, row)):
                 found = line.rstrip("\n")[:60]
                 raise ValueError(f"{path}, line {number}: expected {CSV_HEADER}, found {found!r}")
             rows.append(row)

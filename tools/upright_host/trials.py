@@ -189,16 +189,20 @@ def _arrays(path: Path) -> dict:
     try:
         with open(path, "rb") as file:
             start = file.read(4)
-        if start != b"PK\x03\x04":
-            raise TrialError(f"{path} is not an .npz archive: it starts with {start!r}")
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in known if name in archive.files}
+            if start != b"PK\x03\x04":
+                raise TrialError(f"{path} is not an .npz archive: it starts with {start!r}")
+            file.seek(0)
+            with np.load(file, allow_pickle=False) as archive:
+                arrays = {name: archive[name] for name in known if name in archive.files}
     except TrialError:
         raise
     except zipfile.BadZipFile as error:
         raise TrialError(f"{path} is truncated or damaged: {error}") from error
     except Exception as error:  # numpy lets zlib's, struct's and the parser's errors through
         raise TrialError(f"{path} is damaged: {type(error).__name__}: {error}") from error
+    for name, array in arrays.items():
+        if not isinstance(array, np.ndarray):  # numpy hands such a member over as it is
+            raise TrialError(f"{path} is damaged: {name} is no .npy array")
     missing = [name for name in ("gyr", "acc", "header") if name not in arrays]
     if missing:
         raise TrialError(f"{path} is not a trial: it lacks {', '.join(missing)}")
