@@ -243,11 +243,11 @@ machine.power_on()
 world = World(sys.argv[1])
 world.start(0)
 import board
-from upright_app import doctor
+from upright_app import guided
 parts = boards.wire(sys.argv[2], board, world, {})
 for name, value in json.loads(sys.argv[3]).items():
     setattr(board, name, tuple(value))
-doctor.axes(board, tumble_ms=12000)
+guided.axes(board, tumble_ms=12000)
 """
 
 

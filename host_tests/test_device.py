@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 import serial
-from mpremote.transport import TransportError
+from mpremote.transport import TransportError, TransportExecError
 from upright_host import contents, device, rp2040, runtimes
 from upright_host.console import Wrong
 
@@ -113,6 +113,23 @@ def test_an_emulated_board_that_cannot_be_built_here_is_answered_with_a_finished
     assert "no longer signed" in done.stderr
     assert "`upright runtimes --image FILE.uf2`" in done.stderr
     assert len(done.stderr.splitlines()) == 2  # what it is doing, why not
+
+
+def test_a_traceback_of_the_board_is_told_in_a_line(monkeypatch):
+    said = """Traceback (most recent call last):\r
+  File "<stdin>", line 1, in <module>\r
+  File "board.py", line 9\r
+SyntaxError: invalid syntax\r
+"""
+
+    class Board:
+        def close(self):
+            pass
+
+    monkeypatch.setattr(device, "connect", lambda port: Board())
+    wanted = "^on the board, in board.py, line 9: SyntaxError: invalid syntax$"
+    with pytest.raises(device.DeviceError, match=wanted), device.opened("/dev/ttyACM0"):
+        raise TransportExecError(1, said)
 
 
 class Line:

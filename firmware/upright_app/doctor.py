@@ -1,6 +1,6 @@
-# A board's doctor: which chips answer, which rates are kept, and whether the axis maps in board.py are right.
+# A board's doctor: which chips answer, which rates are kept, and what does not fit board.py.
 # `upright doctor` runs it; on the board: from upright_app import doctor; import board; doctor.report(board).
-# Every port. It uses floats and allocates: not for the tick. The functions that judge take samples, not chips.
+# Every port. It uses floats and allocates: not for the tick.
 
 import gc
 import math
@@ -11,249 +11,11 @@ import upright
 from micropython import const
 from upright.settings import Settings, of_board
 
-from upright_app import axis_check
+from upright_app.source import MICROTESLA, Source, conclude
 
-_RATE_HZ = const(200)  # of the axis check: a loop in bytecode keeps up with it
-_POLL_US = const(500)
 _MEASURE_MS = const(500)
-_POSTURE_MS = const(60000)  # for each posture; then the check ends
-_STILL_MS = const(1000)
-_TUMBLE_MS = const(30000)
-_STILL_DPS = const(6)
-_MICROTESLA = (20, 75)  # the earth's field, with a margin
-
-
-# ------------------------------------------------------------------------------------------ samples of a board
-
-
-class Source:
-    """The chips of a board, read from the main program: next() gives each fresh sample once."""
-
-    def __init__(self, board, rate_hz=None):
-        """Opens the chips. Raises OSError when the sensor does not answer. mag is None without a magnetometer;
-        mag_fault says why one of board.py does not work."""
-        self.config = settings = Settings(of_board(board))
-        self.imu = imu = board.sensor()
-        imu.configure(
-            accel_range_g=settings.ACCEL_RANGE_G,
-            gyro_range_dps=settings.GYRO_RANGE_DPS,
-            dlpf=settings.DLPF,
-            sample_rate_hz=rate_hz or settings.SENSOR_RATE_HZ or settings.RATE,
-        )
-        self.mag = self.mag_fault = None
-        if hasattr(board, "magnetometer"):
-            try:
-                self.mag = board.magnetometer(imu)
-                self.mag.configure(rate_hz=settings.MAG_RATE_HZ)
-            except OSError as why:
-                self.mag = None
-                self.mag_fault = str(why)
-        self._own_mag = self.mag if self.mag is not None and self.mag.own_bus else None
-        self.counts = imu.counts
-        num, den = imu.sample_rate
-        self._early_us = 800000 * den // num  # no other sample comes within this time
-        self.seconds = 0.0  # between the last two fresh samples
-        self._at = time.ticks_us()
-
-    def poll(self):
-        """-> flags of a fresh sample, or 0."""
-        flags = self.imu.read()
-        if not flags & 1:
-            return 0
-        if self._own_mag is not None:
-            flags = self._own_mag.read(self.counts)
-        now = time.ticks_us()
-        self.seconds = time.ticks_diff(now, self._at) / 1000000
-        self._at = now
-        return flags
-
-    def next(self, timeout_ms=200):
-        start = time.ticks_ms()
-        early = self._early_us - time.ticks_diff(time.ticks_us(), self._at)
-        if 0 < early <= self._early_us:
-            time.sleep_us(early)
-        while time.ticks_diff(time.ticks_ms(), start) < timeout_ms:
-            flags = self.poll()
-            if flags:
-                return flags
-            time.sleep_us(_POLL_US)
-        raise OSError("the sensor has stopped")
-
-
-class Posture:
-    """Waits until the board lies still, and holds the mean of its samples then."""
-
-    def __init__(self, source):
-        self._source = source
-        self._num, self._den = source.imu.gyro_scale
-        self.accel = [0.0] * 3
-        self.gyro = [0.0] * 3
-        self.field = None
-
-    def wait(self, wanted):
-        """wanted(axis) -> bool: is this axis (index, sign), pointing up, the posture? True when it has been held."""
-        source, counts = self._source, self._source.counts
-        lsb_per_g = source.imu.accel_lsb_per_g
-        start = time.ticks_ms()
-        while time.ticks_diff(time.ticks_ms(), start) < _POSTURE_MS:
-            total = [0] * 9
-            n = fields = 0
-            first = None
-            since = time.ticks_ms()
-            while time.ticks_diff(time.ticks_ms(), since) < _STILL_MS:
-                flags = source.next()
-                if first is None:
-                    first = [counts[3 + i] for i in range(3)]
-                # the gyro has a bias: at rest means that its reading does not change
-                if (
-                    max(abs(counts[3 + i] - first[i]) for i in range(3))
-                    > _STILL_DPS * self._num // self._den
-                ):
-                    n = 0
-                    break
-                n += 1
-                for i in range(6):
-                    total[i] += counts[i]
-                if flags & 2:
-                    fields += 1
-                    for i in range(6, 9):
-                        total[i] += counts[i]
-            if not n:
-                continue
-            self.accel = [x / n for x in total[:3]]
-            self.gyro = [x / n for x in total[3:6]]
-            self.field = [x / fields for x in total[6:]] if fields else None
-            axis = axis_check.up_axis(self.accel, lsb_per_g)
-            if axis is not None and wanted(axis):
-                return axis
-        return None
-
-
-# ------------------------------------------------------------------------------------------ the check of the axes
-
-
-def axes(board, south=False, tumble_ms=_TUMBLE_MS):
-    """The two-minute check of IMU_AXES and MAG_AXES: says what to do, waits for it, and says what is wrong.
-
-    Nothing has to be typed: each step goes on when the board lies still in its position. Returns the list of problems.
-    """
-    upright.stop()
-    problems = []
-    try:
-        source = Source(board, _RATE_HZ)
-        _axes(source, south, tumble_ms, problems)
-    except OSError as why:
-        problems.append("sensor: %s" % why)
-    _conclude(problems)
-    return problems
-
-
-def _axes(source, south, tumble_ms, problems):
-    settings = source.config
-    posture = Posture(source)
-    seen = []
-    for number, text in enumerate(
-        (
-            "lay the board level, face up, and let go",
-            "stand it up, nose (x) to the sky, and hold still",
-            "put it on its right side, left side (y) to the sky, and hold still",
-        )
-    ):
-        print("%d. %s" % (number + 1, text))
-        axis = posture.wait(lambda axis: all(axis[0] != other[0] for other in seen))
-        if axis is None:
-            problems.append("step %d: not seen within %d s" % (number + 1, _POSTURE_MS // 1000))
-            return
-        seen.append(axis)
-        if number == 0:
-            bias = posture.gyro
-        print("   up is the chip's %s" % axis_check.names([axis]))
-    found = settings.IMU_AXES
-    try:
-        found = axis_check.imu_axes(*seen)
-        if tuple(found) != tuple(settings.IMU_AXES):
-            problems.append("IMU_AXES is %s, should be %s" % (settings.IMU_AXES, found))
-    except ValueError as why:
-        problems.append("%s; do the check again" % why)
-        return
-    verdict = None
-    if source.mag is not None:
-        verdict = _tumble(source, found, bias, south, tumble_ms)
-        _judge_map(source, verdict, problems)
-    elif source.mag_fault:
-        problems.append("magnetometer: %s" % source.mag_fault)
-    _quarter(source, posture, found, verdict, seen[0], problems)
-
-
-def _tumble(source, found, bias, south, tumble_ms):
-    print("4. turn it over and over, slowly, about all its axes, for %d s" % (tumble_ms // 1000))
-    tumble = axis_check.Tumble(source.imu.gyro_scale, source.imu.accel_lsb_per_g, found, bias)
-    start = told = time.ticks_ms()
-    while time.ticks_diff(time.ticks_ms(), start) < tumble_ms:
-        source.next()
-        tumble.add(source.counts, source.seconds)
-        if time.ticks_diff(time.ticks_ms(), told) >= 5000:
-            told = time.ticks_ms()
-            print("   %d turns" % tumble.n)
-    return tumble.result(south)
-
-
-def _judge_map(source, verdict, problems):
-    if verdict.problem:
-        problems.append("magnetometer: " + verdict.problem)
-    if verdict.axes is None:
-        return
-    num, den = getattr(source.mag, "lsb_per_uT", (33, 10))
-    strength = verdict.strength * den / num
-    print(
-        "   field %d uT, %d deg into the ground, offset %s counts; unexplained %.2f, next map %.2f"
-        % (
-            strength,
-            verdict.dip_deg,
-            [round(x) for x in verdict.offset],
-            verdict.score,
-            verdict.second,
-        )
-    )
-    if tuple(verdict.axes) != tuple(source.config.MAG_AXES):
-        problems.append("MAG_AXES is %s, should be %s" % (source.config.MAG_AXES, verdict.axes))
-    if not _MICROTESLA[0] <= strength <= _MICROTESLA[1]:
-        problems.append("the field is %d uT: iron or a magnet near, or the wrong scale" % strength)
-
-
-def _quarter(source, posture, found, verdict, level, problems):
-    print(
-        "5. lay it level, then turn it level by a quarter to the left (seen from above), and let go"
-    )
-    if posture.wait(lambda axis: axis == level) is None:
-        problems.append("step 5: not level within %d s" % (_POSTURE_MS // 1000))
-        return
-    bias, before = posture.gyro, posture.field
-    print("   now turn")
-    num, den = source.imu.gyro_scale
-    map_ = axis_check.parse(found)
-    turned = 0.0
-    quiet = start = time.ticks_ms()
-    while time.ticks_diff(time.ticks_ms(), start) < _POSTURE_MS:
-        source.next()
-        rate = axis_check.mapped(
-            [(source.counts[3 + i] - bias[i]) * den / num for i in range(3)], map_
-        )
-        turned += rate[2] * source.seconds
-        if max(abs(x) for x in rate) > _STILL_DPS or abs(turned) < 20:
-            quiet = time.ticks_ms()
-        if time.ticks_diff(time.ticks_ms(), quiet) >= _STILL_MS:
-            break
-    needle = None
-    if verdict is not None and verdict.axes is not None and before is not None:
-        posture.wait(lambda axis: axis == level)
-        if posture.field is not None:
-            needle = axis_check.needle_turn(before, posture.field, verdict.axes, verdict.offset)
-    print("   gyro %d deg, field %s deg" % (turned, "-" if needle is None else round(needle)))
-    problems += axis_check.judge_turn(turned, needle)
-
-
-# ------------------------------------------------------------------------------------------ the report
+_BATCH = const(8)  # packets of the FIFO in one burst
+_STEPS = const(50)
 
 
 class _Counter:
@@ -279,51 +41,194 @@ def report(board):
         settings.check(9 if hasattr(board, "magnetometer") else 6)
     except ValueError as why:
         problems.append(str(why))
-        _conclude(problems)
-        return problems
-    _report_display(board, settings, problems)
-    _report_tick(board, settings, problems)
+        return conclude(problems)
+    display = _report_display(board, settings, problems)
+    soft = _report_tick(board, settings, problems)
     try:
         source = Source(board)
     except (OSError, ValueError) as why:
         problems.append("sensor: %s. Check power, wiring and pins against the board's README" % why)
     else:
-        _report_chips(source, problems)
-    _conclude(problems)
-    return problems
+        if _report_chips(source, problems):
+            source.configure(settings.RATE)
+            _report_line(board, source, problems)
+            _report_fifo(source, soft, problems)
+            _report_step(board, settings, problems)
+    if display is not None:
+        _draw_frame(display)
+    return conclude(problems)
 
 
 def _report_display(board, settings, problems):
+    """-> the display, or None."""
     try:
-        display = board.display(settings.DISPLAY_CHUNK)
-        if display is not None:
-            display.begin()
-        print("display: %s" % ("none" if display is None else "written to"))
+        display = board.display(settings.DISPLAY_CHUNK) if hasattr(board, "display") else None
+        if display is None:
+            print("display: none")
+            return None
+        display.begin()
     except (OSError, ValueError) as why:
         problems.append("display: %s. The firmware runs without it" % why)
+        return None
+    panel, found = getattr(display, "panel", ""), _controller(display)  # a driver of one's own
+    print("display:", panel, "answers like an %s" % found if found else "written to")
+    if panel and found not in (None, panel.split()[0]):
+        problems.append(
+            'display: board.py says "%s", but it answers like an %s: set "%s %s"'
+            % (panel, found, found, panel.split()[1])
+        )
+    return display
+
+
+def _controller(display):
+    """ "SH1106": what is written to its RAM can be read over I2C. "SSD1306": it cannot (8.1.5; what comes is the
+    status). None: on SPI, or a read is refused. As FlashFloppy tells them apart (src/display, oled_probe_model)."""
+    bus = display.bus
+    if not hasattr(bus, "readfrom_into"):
+        return None
+    point = b"\x80\xb0\x80\x10\x80\x00\xc0"  # page 0, column 0, data; control bytes before each
+    answer, wrote = bytearray(2), None
+    try:
+        for mask in (0x5A, 0x3C, 0x81):
+            bus.writeto(display.address, point)
+            bus.readfrom_into(display.address, answer)  # the first byte is none
+            if wrote not in (None, answer[1]):
+                return "SSD1306"
+            wrote = answer[1] ^ mask
+            bus.writeto(display.address, point + bytes((wrote,)))
+    except OSError:
+        return None
+    return "SH1106"
+
+
+def _draw_frame(display):
+    """Whether the panel's size and offset are right only a person sees."""
+    display.fill(0)
+    display.rect(0, 0, display.width, display.height)
+    display.text("%dx%d" % (display.width, display.height), 4, 4)
+    try:
+        display.begin()
+    except OSError:
+        return
+    print(
+        "look at the display: a frame along all four edges, and its size. A side missing, or noise at one:"
+    )
+    print(
+        "   the panel is another one, or needs column_offset=; the board's README lists the panels"
+    )
 
 
 def _report_tick(board, settings, problems):
+    """-> whether the tick is soft, so that the FIFO keeps the time."""
     counter = _Counter()
     num, den = settings.RATE
     try:
         ticker = board.make_tick(settings.RATE, counter.count)
     except (OSError, ValueError) as why:
         problems.append("tick: %s" % why)
-        return
+        return True
     time.sleep_ms(_MEASURE_MS)
     ticker.stop()
     rate = counter.n * 1000 // _MEASURE_MS
     print("tick: %s, %d Hz of %d/%d" % (ticker.what, rate, num, den))
-    if not ticker.hard:
+    if not ticker.hard and settings.DRIVE == "timer":
         problems.append(
-            "tick: this port or version has no hard timer callbacks; samples wait for the main program"
+            "tick: this port or version has no hard timer callbacks, so samples are lost while the main program is "
+            'busy: DRIVE = "fifo"'
         )
     if abs(rate * den - num) > 0.05 * num + 4 * den:
         problems.append("tick: %d Hz instead of %d/%d: choose a lower RATE" % (rate, num, den))
+    return not ticker.hard
+
+
+def _report_line(board, source, problems):
+    """The INT line: it has a pulse for each sample."""
+    if not hasattr(board, "data_ready_pin"):
+        return
+    from upright import timing
+
+    counter = _Counter()
+    needed = source.config.DRIVE == "data_ready"
+    num, den = source.imu.sample_rate
+    try:
+        source.imu.configure_interrupt()
+        line = timing.DataReady(board.data_ready_pin(), counter.count, 0)
+    except (OSError, ValueError, TypeError, AttributeError) as why:
+        if needed:
+            problems.append("INT line: %s" % why)
+        return
+    time.sleep_ms(_MEASURE_MS)
+    line.stop()
+    rate = counter.n * 1000 // _MEASURE_MS
+    good = abs(rate * den - num) <= 0.1 * num + 4 * den
+    remark = "" if good or needed else ' (needed only with DRIVE = "data_ready")'
+    print("INT line: %d pulses/s of %d/%d%s" % (rate, num, den, remark))
+    if needed and not good:
+        problems.append(
+            "INT line: %d pulses/s instead of %d/%d: is INT wired to the pin of data_ready_pin()?"
+            % (rate, num, den)
+        )
+
+
+def _report_fifo(source, needed, problems):
+    """Whether all that the chip queues at RATE can be fetched."""
+    imu, got = source.imu, 0
+    num, den = imu.sample_rate
+    overflows = imu.fifo_overflows
+    try:
+        imu.fifo_enable(_BATCH)
+        start = time.ticks_ms()
+        while time.ticks_diff(time.ticks_ms(), start) < _MEASURE_MS:
+            n = imu.fifo_poll()
+            for _ in range(n):
+                got += imu.fifo_next() & 1
+            if not n:
+                time.sleep_ms(1)
+        imu.fifo_disable()
+    except OSError as why:
+        problems.append("FIFO: %s" % why)
+        return
+    overflows = imu.fifo_overflows - overflows
+    rate = got * 1000 // _MEASURE_MS
+    print("FIFO: %d packets/s of %d/%d, %d overflows" % (rate, num, den, overflows))
+    needed = source.config.DRIVE == "fifo" or (needed and source.config.DRIVE is None)
+    if needed and (overflows or rate * den < 0.9 * num):
+        problems.append(
+            "FIFO: %d packets/s instead of %d/%d: choose a lower RATE, or a faster bus"
+            % (rate, num, den)
+        )
+
+
+def _report_step(board, settings, problems):
+    """How long a step of the tick takes, measured on the firmware's own, beside its period."""
+    from upright import ahrs
+
+    try:
+        imu = ahrs.from_board(board, drive="manual", measure_bias=False, keep_bias=False, log=None)
+        imu.start()
+    except (OSError, ValueError) as why:
+        problems.append("start: %s" % why)
+        return
+    num, den = settings.RATE
+    period, total, most = 1000000 * den // num, 0, 0
+    for _ in range(_STEPS):
+        began = time.ticks_us()
+        imu.tick.on_sample(None)
+        took = time.ticks_diff(time.ticks_us(), began)
+        total += took
+        most = max(most, took)
+        time.sleep_us(max(period - took, 0))
+    imu.stop()
+    print("step: %d us, at most %d, of a period of %d" % (total // _STEPS, most, period))
+    if most > period:
+        problems.append(
+            "step: up to %d us, but RATE leaves %d: RATE %d, a faster bus or a lighter filter"
+            % (most, period, 1000000 // (most + most // 4))
+        )
 
 
 def _report_chips(source, problems):
+    """-> whether samples come."""
     imu, mag = source.imu, source.mag
     fresh = fields = 0
     square = 0.0
@@ -350,7 +255,7 @@ def _report_chips(source, problems):
     )
     if not fresh:
         problems.append("sensor: it answers, but no sample is ever fresh")
-        return
+        return False
     if imu.errors != errors:
         problems.append(
             "sensor: %d bus errors: shorter wires, a slower bus" % (imu.errors - errors)
@@ -362,8 +267,12 @@ def _report_chips(source, problems):
     _report_self_test(imu, problems)
     if source.mag_fault:
         problems.append("magnetometer: %s. The attitude comes from six axes" % source.mag_fault)
-    if mag is None:
-        return
+    if mag is not None:
+        _report_magnetometer(mag, fields, square, problems)
+    return True
+
+
+def _report_magnetometer(mag, fields, square, problems):
     rate = fields * 1000 // _MEASURE_MS
     print("magnetometer: %s, %d/%d Hz (%d/s read)" % ((mag.chip,) + mag.sample_rate + (rate,)))
     if not fields:
@@ -372,7 +281,7 @@ def _report_chips(source, problems):
     num, den = getattr(mag, "lsb_per_uT", (33, 10))
     strength = math.sqrt(square / fields) * den / num
     print("field: %d uT" % strength)
-    if not _MICROTESLA[0] <= strength <= _MICROTESLA[1]:
+    if not MICROTESLA[0] <= strength <= MICROTESLA[1]:
         problems.append(
             "field: %d uT is not the earth's: move away from iron, calibrate" % strength
         )
@@ -393,10 +302,3 @@ def _report_self_test(imu, problems):
             "self-test: accel x y z, gyro x y z answer %s per mille off the factory's trim: a damaged chip, "
             "or a copy with trims that mean nothing" % (changes,)
         )
-
-
-def _conclude(problems):
-    for problem in problems:
-        print("PROBLEM:", problem)
-    if not problems:
-        print("all is well")

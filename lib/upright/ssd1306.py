@@ -193,6 +193,7 @@ class SSD1306(Canvas):
             raise ValueError("column_offset must be 0 to %d, not %r" % (spare, column_offset))
         super().__init__(width, height)
         self.bus = bus
+        self.panel = panel
         self.address = address
         self.pages = height // 8
         self.chunk = chunk

@@ -37,10 +37,11 @@ def _i2c_board(name, board, world, options):
     """MPU6050 and SSD1306 on one bus, or the display on the next."""
     bus, scl, sda, interrupt = _I2C[name]
     imu = MPU6050Chip(world, who_am_i=options.get("who_am_i") or 0x68)
-    display = SSD1306Chip()
+    display = SSD1306Chip(sh1106=options.get("sh1106", False))
     if options.get("imu", True):
         machine.wire_i2c(bus, imu, scl, sda)
-        machine.wire_pin(interrupt, imu)
+        if options.get("interrupt", True):
+            machine.wire_pin(interrupt, imu)
     if options.get("display", True):
         shared = getattr(board, "DISPLAY_SHARES_BUS", True)
         if shared:
@@ -77,7 +78,8 @@ def wire(name, board, world, options):
     """Wire the simulated parts of boards/<name> -> Parts.
 
     board: its board.py, already imported, or None. options: who_am_i (None: the part that belongs there), and imu, mag,
-    display: False where the part is missing.
+    display: False where the part is missing; interrupt: False where INT is not wired; sh1106: True, the display's
+    controller.
     """
     if name not in BOARDS:
         raise ValueError(

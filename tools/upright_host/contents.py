@@ -10,7 +10,7 @@ from pathlib import Path
 from upright_host import device, packages, paths, registry, runtimes
 
 # Of the application, on demand: `upright doctor` and `upright record` bring them into the board's RAM.
-ON_DEMAND = ("axis_check", "doctor", "record")
+ON_DEMAND = ("axis_check", "doctor", "guided", "record", "source")
 # Of the library, imported only by what is called by hand: the self-test.
 BY_HAND = ("mpu_selftest",)
 # The boards of boards/ and their processors' native code, as mpy-cross calls it

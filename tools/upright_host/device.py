@@ -6,6 +6,7 @@ Stands on mpremote's transports; whatever has their interface will do (the emula
 import ast
 import contextlib
 import os
+import re
 import stat
 import sys
 import time
@@ -195,12 +196,21 @@ def opened(port: str | None, emulated: bool = False):
     try:
         yield transport
     except TransportError as why:
-        raise DeviceError(str(why)) from None
+        raise DeviceError(_in_a_line(str(why))) from None
     except SerialException as why:
         raise DeviceError(f"the line to the board broke off ({why}). Is it plugged in?") from None
     finally:
         with contextlib.suppress(SerialException):
             transport.close()
+
+
+def _in_a_line(said: str) -> str:
+    """A traceback of the board's, if it is one: what was raised, and where."""
+    lines = said.strip().splitlines() or ["the board refused a command, and does not say why"]
+    at = re.findall(r'File "(.*?)", line (\d+)', said)
+    if "Traceback" not in lines[0] or not at:
+        return " ".join(lines)
+    return f"on the board, in {at[-1][0]}, line {at[-1][1]}: {lines[-1].strip()}"
 
 
 def facts(transport) -> Facts:

@@ -25,19 +25,20 @@ def examine(transport, axes: bool, south: bool, on_line) -> list[str]:
     on_line(
         f"{found.machine or found.platform}: MicroPython {version}, {found.free_bytes} bytes of file system free"
     )
-    ram.load(transport, found, "doctor", "axis_check")
+    ram.load(transport, found, *(("guided", "axis_check") if axes else ("doctor",)), "source")
     try:
         wanted = contents.setting(transport.fs_readfile("board.py").decode(), "PLATFORM")
     except ValueError:
         wanted = None  # it is worked out on the board
     if wanted and wanted != found.platform:
         problems.append(f"board.py is for the port {wanted!r}, this is {found.platform!r}")
-    call = f"doctor.axes(board, {south})" if axes else "doctor.report(board)"
+    module = "guided" if axes else "doctor"
+    call = f"guided.axes(board, {south})" if axes else "doctor.report(board)"
     said = []
     lines = Lines({_MARK: lambda line: said.append(ast.literal_eval(line))}, on_line)
     # Modules stay: collected between them, they do not lie scattered over a small heap.
     transport.exec(
-        "import gc, board\ngc.collect()\nfrom upright_app import doctor\nRam.files.clear()\ngc.collect()"
+        f"import gc, board\ngc.collect()\nfrom upright_app import {module}\nRam.files.clear()\ngc.collect()"
     )
     transport.exec(f"print({_MARK!r} + repr({call}))", data_consumer=lines.feed)
     return problems + (said[0] if said else ["the examination did not end"])

@@ -90,6 +90,8 @@ class SSD1306Chip:
         self._arguments = []
         self._control = None
         self._expect_control = False
+        self._last_control = 0
+        self._reads_ram = self._dummy = False
 
     def vanish(self):
         """The power (or a wire) is cut: nothing answers, everything is forgotten."""
@@ -131,6 +133,8 @@ class SSD1306Chip:
             return False
         self.transactions += 1
         self._expect_control = not read
+        self._reads_ram = read and self.sh1106 and self._last_control & 0x40 != 0
+        self._dummy = True
         self._control = None
         return True
 
@@ -140,7 +144,7 @@ class SSD1306Chip:
         if self._expect_control:
             if byte & 0x3F:
                 self._wrong("control byte 0x%02X: its low six bits must be 0" % byte)
-            self._control = byte
+            self._control = self._last_control = byte
             self._expect_control = False
             return True
         if self._control is None:
@@ -153,9 +157,17 @@ class SSD1306Chip:
         return True
 
     def i2c_read(self, now):
-        """The status: bit 6 is set while the display is off. Data cannot be read serially."""
+        """The status: bit 6 is set while the display is off. An SSD1306's data cannot be read serially; an SH1106's
+        can, after a control byte for data and a first byte that is none."""
         if not self.powered:
             return 0xFF
+        if self._reads_ram:
+            if self._dummy or self.column >= self.columns:
+                self._dummy = False
+                return 0
+            self.column += 1
+            segment = self.columns - self.column if self.remap else self.column - 1
+            return self.ram[self.page * self.columns + segment]
         return 0 if self.display_on else 0x40
 
     def i2c_stop(self, now):
