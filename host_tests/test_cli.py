@@ -177,6 +177,16 @@ WRONG = {
     "board new pico": "is there already: nothing was changed",
     "board new ../pico": "is no name for a folder",
     "board new x --like y": "unknown board 'y'",
+    "flash": "Missing argument 'board'. `upright flash --help` shows what there is",
+    "flash pico --seconds x": "Invalid value for '--seconds'",
+    "flash pico --emulated --port x": "--port or --emulated, not both",
+    "nope": "No such command 'nope'. `upright --help` shows",
+    "--nope": "No such option: --nope. `upright --help` shows",
+    "calibrate gyro CSV --rate inf": "Invalid value for '--rate'",
+    "calibrate gyro CSV --rate 1e300": "Invalid value for '--rate'",
+    "demo --seconds inf": "inf is not a positive number",
+    "exec NONE": "does not exist. `upright exec --help`",
+    "compare TRIAL --png CSV": "that is a file; a folder, or NAME.png, is wanted",
     "exec --runtime z80 CSV": "unknown runtime 'z80'",
     "exec --board abacus CSV": "unknown board 'abacus'",
     "dmp check NONE": "No such file",
@@ -202,7 +212,8 @@ def test_what_is_wrong_is_one_line_without_a_traceback_and_exit_code_2(
     assert isinstance(done.exception, SystemExit), done.exception
     assert done.exit_code == 2, done.output
     assert WRONG[line].replace("CUT", str(cut)).replace("TEXT", str(recorded_csv)) in done.stderr
-    assert "Traceback" not in done.output
+    assert "Traceback" not in done.output and "Usage" not in done.output
+    assert len(done.stderr.splitlines()) <= 3  # what was left out has a line each
 
 
 def test_what_is_not_here_is_exit_code_3(upright, trial, monkeypatch):

@@ -97,7 +97,7 @@ _CHIP = typer.Option(
     None, help="The IMU's name, as the firmware prints it (a recorded .imu knows)."
 )
 _BOARD = typer.Option(None, help="The board's NAME (a recorded .imu knows).")
-_RATE = typer.Option(None, min=1, help="Rows per second of a .csv.")
+_RATE = typer.Option(None, min=1, max=100_000, help="Rows per second of a .csv.")
 _ACCEL_RANGE = typer.Option(8, help="Accelerometer range of a .csv, g.")
 _GYRO_RANGE = typer.Option(2000, help="Gyro range of a .csv, deg/s.")
 
@@ -129,7 +129,10 @@ def register(app: typer.Typer) -> None:
         chip: str = _CHIP,
         board: str = _BOARD,
         lsb_per_ut: float = typer.Option(
-            None, help="Counts per uT, to show the field in uT (IST8310: 3.3)."
+            None,
+            min=0.01,
+            max=100_000,
+            help="Counts per uT, to show the field in uT (IST8310: 3.3).",
         ),
     ):
         """Hard and soft iron from a tumble through all directions."""

@@ -256,6 +256,8 @@ def register(app: typer.Typer) -> None:
         runtime = runtime or simulate.best_runtime()
         if runtime == "rp2040":
             seconds = seconds or replay.BOARD_SECONDS
+        if png and png.exists() and not png.is_dir() and png.suffix != ".png":
+            raise Wrong(f"--png {png}: that is a file; a folder, or NAME.png, is wanted")
         notes, no_picture = [], None
         names = choose(filters, baselines, notes)
         runtimes.interpreter(runtime)

@@ -8,6 +8,7 @@ import contextlib
 import csv
 import errno
 
+import typer
 import typer.core
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
@@ -46,8 +47,16 @@ class Unavailable(Exception):
         )
 
 
+# click's, which typer has under another name in each of its versions
+_UsageError = typer.BadParameter.__base__
+
+
 class Commands(typer.core.TyperGroup):
     """Commands whose exceptions become a line and an exit code."""
+
+    def make_context(self, *arguments, **more):
+        with failing():
+            return super().make_context(*arguments, **more)
 
     def invoke(self, ctx):
         with failing():
@@ -56,9 +65,15 @@ class Commands(typer.core.TyperGroup):
 
 @contextlib.contextmanager
 def failing():
-    """Show Failed, Wrong, Unavailable and OSError as one line; leave with the code that belongs to it."""
+    """Show what is wrong with a command, a file or this machine as a line; leave with the code that belongs to it."""
     try:
         yield
+    except _UsageError as why:
+        if type(why).__name__ == "NoArgsIsHelpError":
+            raise
+        of = " ".join(["upright", *why.ctx.command_path.split()[1:]]) if why.ctx else "upright"
+        said = " ".join(why.format_message().split()).rstrip(".")
+        fail(f"{said}. `{of} --help` shows what there is", WRONG)
     except Unavailable as why:
         fail(why.line(), NOT_HERE)
     except Wrong as why:

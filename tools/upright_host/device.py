@@ -187,6 +187,8 @@ def opened(port: str | None, emulated: bool = False):
     from mpremote.transport import TransportError
     from serial import SerialException
 
+    if emulated and port:
+        raise Wrong("the emulated board has no port: --port or --emulated, not both")
     if emulated:
         from upright_host import emulated as pico
 

@@ -26,7 +26,7 @@ Made from [{like}](../{like}/README.md) by `upright board new`. Its README says 
 
 def make(name: str, like: str | None = None) -> str:
     """Make boards/NAME, which is not there yet -> the board that it was made from. Raises Wrong."""
-    if not re.fullmatch("[a-z][a-z0-9_]*", name):
+    if not re.fullmatch("(?!(aux|con|nul|prn)$)[a-z][a-z0-9_]*", name):  # no files to Windows
         raise Wrong(f"{name!r} is no name for a folder of boards/: lower-case letters, digits, _")
     folder = paths.BOARDS / name
     if folder.exists():

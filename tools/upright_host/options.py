@@ -57,6 +57,6 @@ def writable(path: Path | None):
 
 
 def _positive(value: float | None):
-    if value is not None and not value > 0:
+    if value is not None and not 0 < value < 1e8:  # three years
         raise Wrong(f"{value} is not a positive number of seconds")
     return value

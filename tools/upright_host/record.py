@@ -64,8 +64,10 @@ def register(app: typer.Typer):
         file: Path = typer.Argument(
             ..., callback=options.writable, help="The file to write, NAME.imu."
         ),
-        seconds: int = typer.Option(60, min=1, help="For so long; Ctrl-C ends it earlier."),
-        rate: int = typer.Option(100, min=1, help="Samples a second."),
+        seconds: int = typer.Option(
+            60, min=1, max=100_000, help="For so long; Ctrl-C ends it earlier."
+        ),
+        rate: int = typer.Option(100, min=1, max=1000, help="Samples a second."),
         port: str = typer.Option(
             None, help="The board's serial port (default: the only one there is)."
         ),

@@ -92,6 +92,10 @@ def _from_imu(path: Path) -> Recording:
     except ValueError as why:
         raise Wrong(str(why)) from why
     held.close()
+    for name in ("accel_lsb_per_g", "gyro_scale"):
+        value = getattr(held, name)
+        if max(value if isinstance(value, tuple) else (value,)) >= 2**31:
+            raise Wrong(f"{path}: {name} {value} is none of a sensor")
     if not 1e-3 <= fractions.Fraction(*held.rate) <= 1e6:
         raise Wrong(f"{path}: a rate of {held.rate[0]}/{held.rate[1]} Hz is none")
     data = path.read_bytes()
