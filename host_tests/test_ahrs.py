@@ -596,6 +596,7 @@ WRONG = [
     ("measure_bias", "no"),
     ("display_shares_bus", None),
     ("dmp_image", 5),
+    *(("dmp_sha256", x) for x in (5, "ab")),
     ("log", 5),
     ("timer", "7"),
     ("timer", lambda rate, callback: None),

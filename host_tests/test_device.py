@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 import serial
 from mpremote.transport import TransportError, TransportExecError
-from upright_host import contents, device, rp2040, runtimes
+from upright_host import contents, device, flash, rp2040, runtimes
 from upright_host.console import Wrong
 
 FACTS = device.Facts("rp2", "Pico", (1, 26, 1), 6, 3, "armv6m", True, False, True, True, 900000)
@@ -165,3 +165,20 @@ def test_a_restart_is_watched_until_the_tick_runs(text, runs):
     assert device.restart(line, 10, lines.append, lambda said: said.startswith("tick:")) == runs
     assert lines == text.decode().splitlines()
     assert (line.monotonic() < 1) == runs
+
+
+def test_a_port_of_micropython_whose_timers_are_unknown_is_named(monkeypatch, capsys):
+    class Enough(Exception):
+        pass
+
+    def stop(*a, **k):
+        raise Enough
+
+    nrf = device.Facts("nrf52", "", (1, 26, 1), 6, 3, "armv7em", True, False, True, False, 0)
+    monkeypatch.setattr(device, "facts", lambda transport: nrf)
+    monkeypatch.setattr(contents, "platform", lambda board: "nrf52")
+    monkeypatch.setattr(contents, "board_files", stop)
+    with pytest.raises(Enough):
+        flash.run(SimpleNamespace(fs_readfile=lambda name: b""), "pico", False, False)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "knows no timer of MicroPython's port 'nrf52'" in said and "make_tick()" in said

@@ -80,6 +80,16 @@ def test_links_lead_somewhere(page):
 
 
 @EVERY_PAGE
+def test_mpremote_is_the_one_of_setup_and_is_given_no_pattern(page):
+    """Debian's Python refuses `pip install mpremote`; Windows' shells hand `*` over as it is."""
+    commands = re.findall(r"(?:`|^ *)([\w./]*mpremote [^`\n]*)", page.read_text(), re.M)
+    for command in commands:
+        assert "*" not in command
+        assert command.startswith(".venv/bin/mpremote ") or name(page) == "README.md"
+    assert not re.search(r"^ *pip install mpremote", page.read_text(), re.M)
+
+
+@EVERY_PAGE
 def test_commands_exist(page):
     commands = {command.name for command in cli.app.registered_commands}
     commands |= {group.name for group in cli.app.registered_groups}

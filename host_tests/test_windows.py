@@ -5,7 +5,9 @@ import runpy
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from types import SimpleNamespace
 
 import pytest
 from upright_host import paths
@@ -79,6 +81,22 @@ def test_a_lock_keeps_another_process_waiting_and_goes_with_its_process(tmp_path
 )
 def test_setup_knows_where_each_system_has_an_environments_programs(venv, python):
     assert str(BOOTSTRAP["program"](venv, "python")) == python
+
+
+@pytest.mark.parametrize("refused, ends", [(0, True), (1, True), (2, False)])
+def test_a_system_that_cannot_have_what_the_tests_need_gets_the_command_alone(
+    monkeypatch, capfd, refused, ends
+):
+    asked = []
+
+    def run(command):
+        asked.append(command[-1])
+        return SimpleNamespace(returncode=int(len(asked) <= refused))
+
+    monkeypatch.setattr(subprocess, "run", run)
+    with nullcontext() if ends else pytest.raises(SystemExit, match="could not install"):
+        BOOTSTRAP["install_packages"]()
+    assert asked == [f"{paths.ROOT}[test]", str(paths.ROOT)][: refused + 1]
 
 
 def test_make_setup_and_a_machine_without_make_use_one_script():

@@ -7,7 +7,6 @@ package of these cannot be had, the tests that need it skip, each with its line.
 """
 
 import importlib.util
-import os
 import subprocess
 import sys
 import tempfile
@@ -72,7 +71,6 @@ def make():
     if subprocess.run(venv if has_pip else [*venv, "--without-pip"]).returncode:
         fail(f"{' '.join(venv)} failed, see above")
     print("setup: installing the host side's packages", flush=True)
-    install = [*INSTALL, "-e", f"{ROOT}[test]"]
     with tempfile.TemporaryDirectory() as folder:
         pip = (
             [str(PYTHON), "-m", "pip"]
@@ -81,11 +79,19 @@ def make():
         )
         if not has_pip and subprocess.run([*pip, "install", "-q", "pip"]).returncode:
             fail("pip could not be installed, see above")
-        if subprocess.run([str(PYTHON), "-m", "pip", *install], env=os.environ).returncode:
-            fail("pip could not install the packages, see above")
+    install_packages()
     STAMP.write_text(stamp(), "utf-8")
     upright = program(VENV, "upright").relative_to(ROOT)
     print(f"setup: done; {upright} --help", flush=True)
+
+
+def install_packages():
+    """The command and what its tests need; where a system cannot have all of that, the command alone."""
+    pip = [str(PYTHON), "-m", "pip", *INSTALL, "-e"]
+    if subprocess.run([*pip, f"{ROOT}[test]"]).returncode:
+        print("setup: not all that the tests need is to be had here: the command alone", flush=True)
+        if subprocess.run([*pip, str(ROOT)]).returncode:
+            fail("pip could not install the packages, see above")
 
 
 def add_extras():

@@ -125,6 +125,9 @@ class Settings:
         image = self.DMP_IMAGE
         good = isinstance(image, (str, bytes, bytearray)) or hasattr(image, "seek")
         self._demand(wrong, "DMP_IMAGE", good, "the name of a file")
+        digest = self.DMP_SHA256
+        good = digest is None or (isinstance(digest, str) and len(digest) == 64)
+        self._demand(wrong, "DMP_SHA256", good, "64 hexadecimal digits, or None")
         self._demand(wrong, "GAINS", isinstance(self.GAINS, dict), "a dict")
         for name in ("EXTERNAL_CLOCK", "MEASURE_BIAS", "KEEP_BIAS", "DISPLAY_SHARES_BUS"):
             value = getattr(self, name)

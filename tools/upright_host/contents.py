@@ -166,6 +166,11 @@ def setting(text: str, name: str):
     return None
 
 
+def known_ports() -> dict[str, int]:
+    """MicroPython's ports, by sys.platform, whose timers the library knows."""
+    return setting((paths.PACKAGE / "timing.py").read_text("utf-8"), "PORTS")
+
+
 def platform(board: str) -> str | None:
     """The MicroPython port that a board's board.py is for (its PLATFORM), None when it says nothing."""
     return setting((paths.BOARDS / board / "board.py").read_text("utf-8"), "PLATFORM")

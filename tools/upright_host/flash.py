@@ -481,6 +481,11 @@ def run(transport, board: str, source: bool, force: bool, everything: bool = Fal
         raise device.DeviceError(
             f"boards/{board} is for MicroPython's port {wanted!r}; this board runs {found.platform!r}"
         )
+    if found.platform not in contents.known_ports():
+        say(
+            f"Upright knows no timer of MicroPython's port {found.platform!r}: board.py needs a make_tick() of its own,"
+            ' or DRIVE = "data_ready" or "manual"'
+        )
     if found.frozen:
         say(f"Upright {found.frozen} is frozen into this firmware, and is what will run")
     files = contents.board_files(board, found, source, _own(transport), everything)
