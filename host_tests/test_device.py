@@ -182,3 +182,18 @@ def test_a_port_of_micropython_whose_timers_are_unknown_is_named(monkeypatch, ca
         flash.run(SimpleNamespace(fs_readfile=lambda name: b""), "pico", False, False)
     said = " ".join(capsys.readouterr().out.split())
     assert "knows no timer of MicroPython's port 'nrf52'" in said and "make_tick()" in said
+
+
+@pytest.mark.parametrize(
+    "text, seconds, ends",
+    [
+        (b"bias: [1, 2, 3] mdeg/s\ntick: timer\n", None, "It works: the tick runs"),
+        (b"sensor: nobody answers at 0x68\n", None, "No tick yet. The lines above say why"),
+        (b"tick: timer\n", 1.0, "tick: timer"),
+    ],
+)
+def test_flash_ends_with_what_success_looks_like_or_with_what_to_do(capsys, text, seconds, ends):
+    flash.show_start(Line(text), seconds)
+    said = capsys.readouterr().out.strip().splitlines()
+    assert said[0] == "restarting:" and text.decode().split("\n")[0] in said[1]
+    assert said[-1].strip().startswith(ends)
