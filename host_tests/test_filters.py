@@ -77,8 +77,8 @@ def test_the_firmware_shows_what_the_dmp_says(boot_board, demo_world, tmp_path, 
 @pytest.mark.parametrize(
     "faults",
     [
-        [[2_000_000, "imu", "brown_out"]],
-        [[2_000_000, "imu", "vanish"], [2_700_000, "imu", "come_back"]],
+        [[2_000_000, "imu", "brown_out", None]],
+        [[2_000_000, "imu", "silent", 700_000]],
     ],
     ids=["brown-out", "gone for a while"],
 )

@@ -361,7 +361,7 @@ def test_a_magnetometer_that_appears_late_is_set_up_by_the_tick(boot):
     run = boot(
         world=None,
         seconds=8,
-        faults=[[0, "mag", "vanish"], [6 * SECOND, "mag", "come_back"]],
+        faults=[[0, "mag", "silent", 6 * SECOND]],
     )
     healthy(run.result)
     assert first_after(run, 6 * SECOND, 2) < 500000
@@ -370,7 +370,7 @@ def test_a_magnetometer_that_appears_late_is_set_up_by_the_tick(boot):
 def test_a_magnetometer_that_vanishes_is_done_without_and_taken_up_again(boot, demo_world):
     run = boot(
         seconds=6,
-        faults=[[3 * SECOND, "mag", "vanish"], [4 * SECOND, "mag", "come_back"]],
+        faults=[[3 * SECOND, "mag", "silent", SECOND]],
     )
     healthy(run.result)
     gone = (run.times > 3020000) & (run.times < 4 * SECOND)
@@ -383,7 +383,7 @@ def test_a_magnetometer_that_vanishes_is_done_without_and_taken_up_again(boot, d
 
 
 def test_nack_storms_on_the_auxiliary_bus_cost_samples_of_the_magnetometer_alone(boot, demo_world):
-    faults = [[2 * SECOND + 41000 * i, "mag", "nack_next", 7] for i in range(40)]
+    faults = [[2 * SECOND + 41000 * i, "mag", "nack", None, 7] for i in range(40)]
     run = boot(faults=faults)
     healthy(run.result)
     assert longest_gap(run, 1, 2 * SECOND) <= 2000
@@ -398,7 +398,7 @@ def test_an_imu_that_resets_itself_is_back_in_time_and_brings_the_magnetometer(b
         world=None,
         seconds=6,
         board={"DRIVE": drive, "FIFO_HZ": 200},
-        faults=[[4 * SECOND, "imu", "brown_out"]],
+        faults=[[4 * SECOND, "imu", "brown_out", None]],
     )
     healthy(run.result)
     assert run.result["resets"] == 1
@@ -411,7 +411,7 @@ def test_an_imu_that_resets_itself_is_back_in_time_and_brings_the_magnetometer(b
 def test_the_attitude_and_the_bias_outlive_a_reset_of_both_chips(boot, demo_world):
     run = boot(
         seconds=8,
-        faults=[[5 * SECOND, "imu", "brown_out"], [5 * SECOND, "mag", "brown_out"]],
+        faults=[[5 * SECOND, "imu", "brown_out", None], [5 * SECOND, "mag", "brown_out", None]],
     )
     healthy(run.result)
     assert run.result["bias_known"]
@@ -425,7 +425,7 @@ def test_an_imu_that_nobody_hears_on_spi_is_counted_and_back_again(boot):
     run = boot(
         world=None,
         seconds=6,
-        faults=[[4 * SECOND, "imu", "vanish"], [4300000, "imu", "come_back"]],
+        faults=[[4 * SECOND, "imu", "silent", 300000]],
     )
     healthy(run.result)
     assert run.result["errors"] >= 250

@@ -12,6 +12,26 @@ from upright_app import pages
 
 _FRAME_MS = const(100)
 _RETRY_MS = const(1000)
+# What machine.reset_cause() may give: each port has some of these names.
+_CAUSES = (
+    ("PWRON_RESET", "power-on"),
+    ("HARD_RESET", "reset pin or machine.reset()"),
+    ("WDT_RESET", "watchdog"),
+    ("BROWN_OUT_RESET", "supply too low"),
+    ("DEEPSLEEP_RESET", "deep sleep"),
+    ("SOFT_RESET", "soft reset"),
+)
+
+
+def reset_cause():
+    """Why the board has started, in words."""
+    if not hasattr(machine, "reset_cause"):
+        return "unknown: this port does not say"
+    cause = machine.reset_cause()
+    for name, words in _CAUSES:
+        if cause == getattr(machine, name, None):
+            return words
+    return "cause %r" % cause
 
 
 class App:
@@ -25,12 +45,27 @@ class App:
         self._pages = None if imu.display is None else pages.Pages(imu.display)
         self._frame_at = self._page_at = time.ticks_ms()
         self._reported = 0
+        self._watchdog = None
+        self._fed_at = 0  # fresh samples when the watchdog was last fed
+        self._restarted = None  # what the first message of a start says about the one before
 
     def run(self):
+        """Run for ever. Only a wrong setting, a Ctrl-C, or the watchdog's reset end it."""
+        self.tell_cause()
         self.start()
+        self.start_watchdog()
         while True:
-            self.poll()
-            machine.idle()
+            try:
+                self.poll()
+                machine.idle()
+            except Exception as why:
+                self.recover(why)
+
+    def tell_cause(self):
+        cause = reset_cause()
+        print("started by:", cause)
+        if cause == "watchdog":
+            self._restarted = "watchdog reset"
 
     def start(self):
         """Try until the sensor answers. Raises ValueError for a wrong setting: board.py must change."""
@@ -48,6 +83,38 @@ class App:
                 raise
             time.sleep_ms(_RETRY_MS)
 
+    def recover(self, why):
+        """The main loop has raised: show why, and start again until that works."""
+        self._restarted = repr(why)
+        self._reported = 0
+        while True:
+            print("stopped by %r; starting again" % why)
+            try:
+                self.imu.stop()
+                self.say("Starting again", repr(why))
+                time.sleep_ms(_RETRY_MS)
+                self.imu.start()
+                return
+            except Exception as another:
+                why = another
+
+    def start_watchdog(self):
+        """It runs from the first attitude on, and poll() feeds it while fresh samples come."""
+        timeout = self.imu.settings.WATCHDOG_MS
+        if not timeout:
+            print(
+                "watchdog: off, since no port can stop it again; WATCHDOG_MS = 8000 in board.py turns it on"
+            )
+        elif not hasattr(machine, "WDT"):
+            print("watchdog: this port has none")
+        else:
+            try:
+                self._watchdog = machine.WDT(timeout=timeout)
+                print("watchdog: resets the board after %d ms without a fresh sample" % timeout)
+            except TypeError:
+                self._watchdog = machine.WDT()  # esp8266
+                print("watchdog: resets the board after the time that its system sets")
+
     def poll(self):
         """One turn of the main loop: never waits."""
         imu = self.imu
@@ -57,6 +124,9 @@ class App:
             self._frame_at = now
             imu.angles_into(self.angles)
             status = imu.status()
+            if self._watchdog is not None and status["fresh"] != self._fed_at:
+                self._fed_at = status["fresh"]
+                self._watchdog.feed()
             if status["crashes"] != self._reported:
                 self._reported = status["crashes"]
                 print("tick: %d exceptions, last: %r" % (self._reported, status["error"]))
@@ -102,6 +172,9 @@ class App:
         """Show a message on the display while the main program owns its bus. The console has its own messages."""
         display = self.imu.display
         if display is not None:
+            if self._restarted and title == "Upright":
+                lines += (self._restarted,)
+                self._restarted = None
             self._pages.message(title, *lines)
             display.show()
             while display.busy:

@@ -48,6 +48,9 @@ DEFAULTS = {
     "DISPLAY_CHUNK": 32,
     # Seconds that each page of the display is shown; 0: only the first page.
     "PAGE_SECONDS": 6,
+    # The application resets the board after so many ms without a fresh sample, 1000..8000. 0: off, because no port can
+    # stop a watchdog: the board would also reset at the prompt, after a Ctrl-C.
+    "WATCHDOG_MS": 0,
 }
 
 DRIVES = ("timer", "data_ready", "fifo", "manual")
@@ -119,6 +122,9 @@ class Settings:
         good = is_int(chunk, 8, 128) and chunk % 8 == 0
         self._demand(wrong, "DISPLAY_CHUNK", good, "a multiple of 8, 8..128")
         self._demand(wrong, "PAGE_SECONDS", _is_number(self.PAGE_SECONDS, 0), "seconds, 0 or more")
+        # rp2 allows 8388 ms at most (MicroPython's docs, machine.WDT)
+        good = self.WATCHDOG_MS == 0 or is_int(self.WATCHDOG_MS, 1000, 8000)
+        self._demand(wrong, "WATCHDOG_MS", good, "ms as an int, 1000..8000, or 0")
         self._demand(wrong, "DECLINATION", _is_number(self.DECLINATION, -180, 180), "degrees")
         good = self.CALIBRATION is None or isinstance(self.CALIBRATION, str)
         self._demand(wrong, "CALIBRATION", good, "the name of a file, or None")

@@ -48,6 +48,7 @@ def reset():
     """A fresh machine: time 0, nothing scheduled."""
     global _now, _in_irq, _in_soft, _masked, _next, _sources, _hard, _soft, _stop_us, _busy
     global irq_cost_us, after_irq, uncaught, irq_count, reset_request, _locked
+    global longest_irq_us, main_exception
     _now = 0
     _in_irq = False
     _in_soft = False
@@ -63,7 +64,19 @@ def reset():
     after_irq = None  # the harness's observer, called after every hard callback, heap unlocked
     uncaught = []  # exceptions that escaped a hard callback
     irq_count = 0
+    longest_irq_us = 0  # of the hard callbacks
     reset_request = None
+    main_exception = None  # raised in the main program at its next step: Ctrl-C
+
+
+def restart():
+    """The processor resets: callbacks, masks and locks are gone. Time and the wiring go on."""
+    global _in_irq, _in_soft, _masked, _locked, _busy, _hard, _soft, reset_request, main_exception
+    _in_irq = _in_soft = _masked = _locked = False
+    _busy = 0
+    _hard = []
+    _soft = []
+    reset_request = main_exception = None
 
 
 def now():
@@ -109,6 +122,10 @@ def add_source(source):
     if source not in _sources:
         _sources.append(source)
     changed()
+
+
+def sources():
+    return list(_sources)
 
 
 def remove_source(source):
@@ -181,7 +198,11 @@ def advance_to(target):
 
 def _main_turn():
     """What the main program meets between two of its steps: soft callbacks, a reset, the end of the simulation."""
+    global main_exception
     _run_soft()
+    if main_exception is not None and not _in_soft:
+        error, main_exception = main_exception, None
+        raise error
     if reset_request is not None:
         raise Reset(reset_request)
     if _stop_us is not None and _now >= _stop_us:
@@ -206,6 +227,12 @@ def idle():
     advance_to(max(_now, min(next_due(), _now + 1000)))
 
 
+def hold(on):
+    """Keep hard interrupts from coming, as a program does that disables them for long."""
+    global _masked
+    _masked = on
+
+
 def mask(on):
     """Disable or enable hard interrupts; -> the former state."""
     global _masked
@@ -217,7 +244,7 @@ def mask(on):
 
 
 def _run_hard():
-    global _in_irq, _locked, irq_count
+    global _in_irq, _locked, irq_count, longest_irq_us
     while _hard:
         if _stop_us is not None and _now >= _stop_us:
             return  # callbacks longer than their period would starve the main program for ever
@@ -227,16 +254,19 @@ def _run_hard():
         handler, argument, error = irq.handler, irq.argument, None
         _in_irq = True
         _locked = True
+        began = _now
         micropython.heap_lock()
         try:
             handler(argument)
-        except Exception as e:
+        except BaseException as e:
             error = e
         micropython.heap_unlock()
         _locked = False
         if irq_cost_us:
             advance(irq_cost_us)
         _in_irq = False
+        if _now - began > longest_irq_us:
+            longest_irq_us = _now - began
         if error is not None:
             uncaught.append(error)
             print("uncaught exception in a hard callback:", repr(error))

@@ -26,7 +26,14 @@ class _Bus:
         self.busy = False
         self.cuts = 0  # transfers that began while another was under way
         self.spoilt = False
-        self.stuck = False  # a slave holds SDA (or SCL) low: every transfer times out
+        self.stuck = False  # SDA or SCL is held low: every transfer times out
+        self.swallows = (
+            False  # as rp2 may: a written byte that is refused ends the transfer without an error
+        )
+        self.raises = (
+            None  # an exception that the next transfer in an interrupt raises: Ctrl-C, a full heap
+        )
+        self.failed = {}  # transfers that ended with an error, by address
         self.transfers = 0
         self.bytes = 0
 
@@ -35,6 +42,9 @@ class _Bus:
             self.cuts += 1
             self.spoilt = True
             raise OSError(EIO)
+        if self.raises is not None and kernel.in_irq():
+            error, self.raises = self.raises, None
+            raise error
         self.busy = True
         self.spoilt = False
         self.transfers += 1
@@ -72,6 +82,20 @@ class _Clock:
         self.units += units
         at = self.start + -(-self.units * self.unit_ns // 1000)
         kernel.advance_to(max(at, kernel.now()))
+
+
+class _Swallowed(Exception):
+    """A byte was refused, and the port does not tell."""
+
+
+def _timeout_us(us):
+    """What the port makes of a bus's time-out. stm32 rounds up to ms (machine_i2c.c). esp32 counts ticks of 10 ms and
+    rounds down, so a shorter one lets no transfer pass (IDF 5.5.2)."""
+    if port == "stm32":
+        return -(-us // 1000) * 1000
+    if port == "esp32":
+        return us // 10000 * 10000
+    return us
 
 
 class SoftI2C:
@@ -140,35 +164,44 @@ class SoftI2C:
         bus = self._bus
         bus.begin()
         try:
-            clock = self._clock
-            clock.reset()
-            if bus.stuck:
-                kernel.advance(self._timeout)
-                raise OSError(ETIMEDOUT)
-            chip = None
-            for candidate in bus.chips:
-                if candidate.address == address:
-                    chip = candidate
-            at = clock.step(10)
-            reading = register is None and out is None
-            if chip is None or not chip.i2c_start(reading, at):
-                clock.finish(1)
-                raise OSError(EIO)
-            if register is not None:
-                self._put(chip, clock, register)
-            if out is not None:
-                for value in out:
-                    self._put(chip, clock, value)
-            if into is not None:
-                if register is not None and not chip.i2c_start(True, clock.step(10)):
-                    raise OSError(EIO)
-                for i in range(len(into)):
-                    into[i] = chip.i2c_read(clock.step(9))
-                bus.bytes += len(into)
-            chip.i2c_stop(clock.step(1))
-            clock.finish(0)
+            self._carry_out(bus, address, register, out, into)
+        except _Swallowed:
+            pass
+        except OSError:
+            bus.failed[address] = bus.failed.get(address, 0) + 1
+            raise
         finally:
             bus.end()
+
+    def _carry_out(self, bus, address, register, out, into):
+        clock = self._clock
+        clock.reset()
+        timeout = _timeout_us(self._timeout)
+        if bus.stuck or not timeout:
+            kernel.advance(timeout)
+            raise OSError(ETIMEDOUT)
+        chip = None
+        for candidate in bus.chips:
+            if candidate.address == address:
+                chip = candidate
+        at = clock.step(10)
+        reading = register is None and out is None
+        if chip is None or not chip.i2c_start(reading, at):
+            clock.finish(1)
+            raise OSError(EIO)
+        if register is not None:
+            self._put(chip, clock, register)
+        if out is not None:
+            for value in out:
+                self._put(chip, clock, value)
+        if into is not None:
+            if register is not None and not chip.i2c_start(True, clock.step(10)):
+                raise OSError(EIO)
+            for i in range(len(into)):
+                into[i] = chip.i2c_read(clock.step(9))
+            bus.bytes += len(into)
+        chip.i2c_stop(clock.step(1))
+        clock.finish(0)
 
     def _put(self, chip, clock, value):
         at = clock.step(9)
@@ -176,7 +209,7 @@ class SoftI2C:
         if not chip.i2c_write(value, at):
             chip.i2c_stop(at)
             clock.finish(1)
-            raise OSError(EIO)
+            raise _Swallowed if self._bus.swallows else OSError(EIO)
 
 
 class I2C(SoftI2C):
@@ -303,6 +336,7 @@ class _Wire:
         self.listeners = []  # called with (level, now) when the board drives it
         self.irq = None
         self.trigger = 0
+        self.cut = False  # the wire is: edges are lost
 
     def due(self):
         # only an interrupt has to see an edge when it comes: whoever reads the pin gets the level of that moment
@@ -320,7 +354,7 @@ class _Wire:
             return
         self.level = level
         edge = Pin.IRQ_RISING if level else Pin.IRQ_FALLING
-        if self.irq and self.trigger & edge:
+        if self.irq and self.trigger & edge and not self.cut:
             self.irq.request()
 
 
@@ -395,6 +429,8 @@ class Timer:
 
     ONE_SHOT = 0
     PERIODIC = 1
+    silent = False  # True: no timer of the board calls
+    dropped = 0  # calls that did not come for that
 
     def __init__(self, id=-1, **options):
         if not -1 <= id <= 3:
@@ -443,7 +479,9 @@ class Timer:
             kernel.changed()
         else:
             kernel.remove_source(self)
-        if irq.handler:
+        if Timer.silent:
+            Timer.dropped += 1
+        elif irq.handler:
             irq.request()
 
 
@@ -559,15 +597,38 @@ def wire_reset(pin, chip):
     _wire(pin).listeners.append(chip.reset_pin)
 
 
-def power_on(cause=PWRON_RESET):
-    """A fresh board: no wiring, time 0."""
-    global _i2c, _i2c_pins, _spi, _wires, _cause
+def power_on(cause=PWRON_RESET, like="rp2"):
+    """A fresh board: no wiring, time 0. like: the port whose habits its buses have, "rp2", "esp32" or "stm32"."""
+    global _i2c, _i2c_pins, _spi, _wires, _cause, port
     kernel.reset()
+    port = like
+    Timer.silent = False
+    Timer.dropped = 0
     _i2c = {}
     _i2c_pins = {}
     _spi = {}
     _wires = {}
     _cause = cause
+
+
+def restart(cause):
+    """The processor resets; the chips, their state and their wiring stay."""
+    global _cause
+    kernel.restart()
+    _cause = cause
+    for source in kernel.sources():
+        if isinstance(source, (Timer, WDT)):
+            kernel.remove_source(source)
+    for wire in _wires.values():
+        wire.irq = None
+    for buses in (_i2c, _spi):
+        for bus in buses.values():
+            bus.busy = bus.spoilt = False
+
+
+def wires():
+    """The state of each pin that is in use."""
+    return list(_wires.values())
 
 
 def _number(pin):

@@ -7,6 +7,7 @@ import sys
 from array import array
 from binascii import hexlify
 
+import faults
 import kernel
 import machine
 from world import StillWorld, World
@@ -28,27 +29,11 @@ CONFIG = {
     "dmp_image": None,  # a file that the IMU's DMP runs when it is loaded
     "irq_cost_us": 0,  # what the tick's code takes, beside its bus time
     "twin": None,  # "main_writes_shared_bus": what the firmware must not do, to show that it would be noticed
-    "faults": [],  # [at_us, "imu", "mag", "display" or "bus", method, arguments...]: what goes wrong, and when
+    "faults": [],  # what goes wrong, and when: faults.py
+    "like": "rp2",  # the port whose habits the buses have
+    "begin_us": 0,  # what the clock says at the start
+    "reset_cause": None,  # of this start; None: power-on
 }
-
-
-class Faults:
-    """Calls a simulated part's method at its time: vanish, come_back, brown_out, nack_next, ..."""
-
-    def __init__(self, faults, parts):
-        self._faults = sorted(faults)
-        self._parts = parts
-
-    def due(self):
-        return self._faults[0][0] if self._faults else None
-
-    def fire(self, now):
-        fault = self._faults.pop(0)
-        part, method = self._parts[fault[1]], fault[2]
-        if method == "stuck":
-            part.stuck = fault[3]
-        else:
-            getattr(part, method)(*fault[3:])
 
 
 class Frames:
@@ -57,7 +42,7 @@ class Frames:
     def __init__(self, chip, every_ms):
         self._chip = chip
         self._every = every_ms * 1000
-        self._at = 0
+        self._at = self._start = kernel.now()
         self._last = None
 
     def due(self):
@@ -68,9 +53,9 @@ class Frames:
         picture = bytes(self._chip.frame())
         if picture != self._last:
             self._last = picture
-            print("\tframe", now, str(hexlify(picture), "ascii"))
+            print("\tframe", now - self._start, str(hexlify(picture), "ascii"))
         else:
-            print("\ttime", now)
+            print("\ttime", now - self._start)
 
 
 def the_ahrs():
@@ -83,6 +68,7 @@ class Recorder:
     """The attitude after every step, with the row of the world that it belongs to."""
 
     def __init__(self, path, world, chip):
+        self._start = kernel.now()
         self._file = open(path, "wb")
         self._world = world
         self._chip = chip
@@ -107,50 +93,138 @@ class Recorder:
             self._mag = mag.fresh
             flags |= 2  # with the FIFO it may have come with any packet of this tick
         self._row[5] = flags
-        self._row[6] = kernel.now()
+        self._row[6] = kernel.now() - self._start
         self._file.write(self._row)
 
     def close(self):
         self._file.close()
 
 
-def main():
-    config = dict(CONFIG)
-    with open(sys.argv[1]) as file:
-        config.update(json.load(file))
-    machine.power_on()
-    world = World(config["world"]) if config["world"] else StillWorld()
-    world.start(0)
+class Watch:
+    """When a flag of status() changes, as the program sees it: changes is a list of [us, name, value]."""
 
+    NAMES = ("sensor_lost", "magnetometer_lost")
+
+    def __init__(self):
+        self.changes = []
+        self._start = kernel.now()
+        self._seen = {}
+
+    def attach(self):
+        from upright import ahrs
+
+        status = ahrs.AHRS.status
+        watch = self
+
+        def watched(self):
+            found = status(self)
+            for name in watch.NAMES:
+                if found[name] != watch._seen.get(name, False):
+                    watch._seen[name] = found[name]
+                    watch.changes.append([kernel.now() - watch._start, name, found[name]])
+            return found
+
+        ahrs.AHRS.status = watched
+
+
+def load_board(config):
     import board
 
     for name, value in config["board"].items():
         setattr(board, name, tuple(value) if isinstance(value, list) else value)
-    parts = boards.wire(config["board_name"], board, world, config)
+    return board
+
+
+def forget_modules():
+    """A reset empties the RAM."""
+    for name in list(sys.modules):
+        if name == "board" or name.split(".")[0] in ("upright", "upright_app"):
+            del sys.modules[name]
+
+
+def main():
+    config = dict(CONFIG)
+    with open(sys.argv[1]) as file:
+        config.update(json.load(file))
+    machine.power_on(config["reset_cause"] or machine.PWRON_RESET, config["like"])
+    if config["begin_us"]:
+        kernel.advance(config["begin_us"])
+    start = kernel.now()
+    world = World(config["world"]) if config["world"] else StillWorld()
+    world.start(start)
+    parts = boards.wire(config["board_name"], load_board(config), world, config)
     if config["dmp_image"]:
         with open(config["dmp_image"], "rb") as file:
             parts.imu.dmp.images.append(file.read())
-    bus = parts.buses[0]
-    faulty = {"imu": parts.imu, "mag": parts.mag, "display": parts.display, "bus": bus}
-    kernel.add_source(Faults(config["faults"], faulty))
+    faulty = {"imu": parts.imu, "mag": parts.mag, "display": parts.display, "bus": parts.buses[0]}
+    plan = faults.Plan(config["faults"], faulty, start)
+    if config["faults"]:
+        kernel.add_source(plan)
+        plan.guard_disk()
     if config["frame_ms"]:
         kernel.add_source(Frames(parts.display, config["frame_ms"]))
     recorder = Recorder(config["out"], world, parts.imu) if config["out"] else None
     if recorder:
         kernel.after_irq = recorder.after_irq
     kernel.irq_cost_us = config["irq_cost_us"]
-    kernel.stop_at(int(config["seconds"] * 1000000))
+    kernel.stop_at(start + int(config["seconds"] * 1000000))
+    watch = Watch()
+    ends = {"resets": 0, "interrupts": 0}
+    fresh = True  # the modules have just been loaded
+    while True:
+        if fresh:
+            prepare(config, plan, watch)
+        fresh = False
+        program = {"__name__": "__main__"}
+        try:
+            execute(config["program"], program)
+            break
+        except kernel.PowerOff:
+            break
+        except kernel.Reset as reset:
+            ends["resets"] += 1
+            print("reset, cause", reset.args[0])
+            machine.restart(reset.args[0])
+            forget_modules()
+            load_board(config)
+            fresh = True
+        except KeyboardInterrupt:
+            if not config["faults"]:
+                raise
+            ends["interrupts"] += 1
+            print("KeyboardInterrupt")  # and somebody starts it again at the prompt
+    application = program.get("application")
+    result = finish(application.imu if application else program.get("imu"), recorder, parts)
+    result["ended_us"] = kernel.now() - start
+    result["board_resets"] = ends["resets"]
+    result["interrupts"] = ends["interrupts"]
+    result["changes"] = watch.changes
+    print("\tresult", json.dumps(result))
+
+
+def prepare(config, plan, watch):
+    """What a run changes in the firmware, after each reset of the board."""
     if config["twin"] == "main_writes_shared_bus":
         spoil_display_ownership()
-    program = {"__name__": "__main__"}
-    try:
-        execute(config["program"], program)
-    except kernel.PowerOff:
-        pass
-    except kernel.Reset as reset:
-        print("reset, cause", reset.args[0])
-    application = program.get("application")
-    finish(application.imu if application else program.get("imu"), recorder, parts)
+    if not config["faults"]:
+        return
+    watch.attach()
+    import upright
+    from upright_app import app
+
+    poll = app.App.poll
+    from_board = upright.from_board
+
+    def poll_or_hang(self):
+        plan.wait()
+        poll(self)
+
+    def with_control(**settings):
+        return from_board(on_step=plan.on_step, **settings)
+
+    app.App.poll = poll_or_hang
+    if any([entry[2] == "raise_in_on_step" for entry in config["faults"]]):
+        upright.from_board = with_control
 
 
 def spoil_display_ownership():
@@ -182,12 +256,14 @@ def execute(name, namespace):
 def finish(imu, recorder, parts):
     buses = parts.buses
     result = {
-        "ended_us": kernel.now(),
         "irqs": kernel.irq_count,
         "cuts": sum([bus.cuts for bus in buses]),
         "bus_bytes": [bus.bytes for bus in buses],
         "display_misuse": parts.display.errors,
         "uncaught": len(kernel.uncaught),
+        "longest_tick_us": kernel.longest_irq_us,
+        "failed": {str(address): n for bus in buses for address, n in bus.failed.items()},
+        "dropped": machine.Timer.dropped,
         "heap_checked": sys.implementation.name == "micropython",
         "started": False,
     }
@@ -225,7 +301,7 @@ def finish(imu, recorder, parts):
                 result["mag_" + name] = getattr(mag, name)
     if recorder:
         recorder.close()
-    print("\tresult", json.dumps(result))
+    return result
 
 
 main()

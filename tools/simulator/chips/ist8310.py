@@ -57,6 +57,7 @@ class IST8310Chip(Faults):
         self.address = address
         self.restarts = restarts
         self.measure_us = None  # a number here is the time of every measurement
+        self.disturbance = (0, 0, 0)  # counts that a magnet beside it adds, body frame
         self.measurements = 0  # done since the start of the simulation
         self.int_level = 0
         self.hung = False  # in the middle of a byte that nobody clocks out
@@ -135,7 +136,7 @@ class IST8310Chip(Faults):
         total = 0
         for axis in range(3):
             word, sign = self._from_body[axis]
-            value = sign * row[6 + word]
+            value = sign * (row[6 + word] + self.disturbance[word])
             if r[_STR] & 0x40:
                 value = -value  # DS 6.4, STR: self-test turns the polarity round
             total += abs(value)
