@@ -8,10 +8,11 @@ from array import array
 import motions
 import numpy as np
 import pytest
+import translate
 from histories import ONE, SCALE, SCALES
-from samples import counts, run
+from samples import SOFTWARE, Scales, counts, run
 from scenes import PACES, all_axes, as_start, errors, pushes, scene
-from upright import earth_kernels
+from upright import earth_kernels, filters
 from upright.inertial import Inertial9
 from upright.quaternion_kalman import QuaternionKalman9
 from upright_host import words
@@ -39,6 +40,45 @@ def history(filter_history, kind):
         return got
 
     return run
+
+
+# -- parameters at their limits
+@pytest.mark.skipif(not translate.GCC, reason=translate.NO_GCC)
+def test_no_parameter_at_its_limit_shifts_by_a_negative_count_or_leaves_32_bits(kind):
+    rng = np.random.default_rng(5)
+    rows = rng.integers(-32768, 32768, (400, 11)).astype(np.int16)
+    rows[200:, :9] = (3, -4, 64, 9, -7, 5, 60, 10, -150)  # at rest
+    rows[:, 10] = 3
+    limits = {name: limits[1:] for name, limits in KINDS[kind].PARAMETERS.items()}
+    for name in limits:
+        for value in (*limits[name], *((0.000001,) if limits[name][0] == 0 else ())):
+            given = {name: value}
+            if name == "bias_start" and value < 1:  # which must be 20 times this
+                given["bias_walk"] = value / 20
+            elif name == "bias_walk" and value:
+                given["bias_start"] = max(0.5, 20 * value)
+            for rate, fsr, lsb in ((50, 250, 64), (100, 2000, 2048), (1439, 250, 32767)):
+                run = translate.make(f"{kind}9", (rate, 1), SCALES[fsr], lsb, **given)
+                run.run(rows, every=0)
+                found = [str(place) for place in run.overflows()]
+                assert not found, (given, rate, fsr, lsb)
+
+
+def test_a_magnetometer_at_full_scale_is_no_heading_to_start_with():
+    for name in SOFTWARE:
+        filter = filters.make(name, 200, Scales, {})
+        for axis in range(3):
+            for value in (32767, -32768):
+                row = counts(flags=3)
+                row[6 + axis] = value
+                assert filter.seed(row)
+                assert yaw_of(filter) == 0, (name, axis, value)
+
+
+def yaw_of(filter):
+    out = array("i", [0] * 3)
+    filter.angles(out)
+    return out[2]
 
 
 # -- the kernels

@@ -324,9 +324,9 @@ class EarthFilter(Attitude):
     def seed(self, counts):
         """Take roll and pitch from one accelerometer sample, heading from the magnetometer's where flags bit 1 is set.
 
-        Without a magnetometer sample yaw is 0 (order zyx). Returns True, or False when the accelerometer is shorter
-        than 1/16 g: then the attitude is the identity. The learnt bias and field stay. Give update() the same
-        sample next.
+        Without a magnetometer sample, or with one of its axes at full scale, yaw is 0 (order zyx). Returns True, or
+        False when the accelerometer is shorter than 1/16 g: then the attitude is the identity. The learnt bias and
+        field stay. Give update() the same sample next.
         """
         x, y, z = counts[0], counts[1], counts[2]
         if (x * x + y * y + z * z) << 8 < self.accel_lsb_per_g**2:
@@ -334,7 +334,10 @@ class EarthFilter(Attitude):
             return False
         i, j, k = counts[6], counts[7], counts[8]
         across = y * k != z * j or z * i != x * k or x * j != y * i
-        if self.AXES == 9 and counts[10] & 2 and across:
+        full = (
+            max(i, j, k) > 32766 or min(i, j, k) < -32766
+        )  # an axis at full scale, as in to_earth
+        if self.AXES == 9 and counts[10] & 2 and across and not full:
             self.start_at(fixmath.attitude_from_up_and_north((x, y, z), (i, j, k)), 2)
         else:
             self.start_at(fixmath.attitude_from_up(x, y, z), 1)

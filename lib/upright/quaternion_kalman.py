@@ -310,6 +310,8 @@ class QuaternionKalman9(EarthFilter):
         s[_QS], s[_QS_SHIFT] = fine_mantissa(
             (value * value << 34) * t, (MILLION * degrees * scale) ** 2 * num, 15
         )
+        if not 15 <= s[_QS_SHIFT] <= 46:  # scale_error is 0, or as good as that
+            s[_QS], s[_QS_SHIFT] = 0, 15
         # variances of measurements, / 16
         s[_RA] = squared(p["accel_noise"], MILLION, 0, 26)
         s[_RV] = squared(p["velocity_noise"] * 100000, MILLION * 980665, -3, 16)
