@@ -3,6 +3,7 @@
 import grp
 import os
 import pty
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -52,8 +53,58 @@ def test_a_port_behind_which_nobody_speaks_micropython_is_told_as_such(terminal,
         device.connect(terminal)
 
 
+@pytest.mark.parametrize("numbers", [(-1,), (3,)], ids=["any timer", "esp32"])
+def test_a_watchdog_of_the_firmware_is_fed_while_the_host_works_at_the_prompt(monkeypatch, numbers):
+    fed, made = [], []
+
+    class Timer:
+        PERIODIC = 1
+
+        def __init__(self, number, *, period, mode, callback):
+            if number not in numbers:
+                raise ValueError("no such timer")
+            made.append((period, callback))
+
+    class Machine:
+        @staticmethod
+        def WDT(timeout):
+            return SimpleNamespace(feed=lambda: fed.append(timeout))
+
+    Machine.Timer = Timer
+
+    class Board:
+        def fs_readfile(self, name):
+            return b"RATE = 100\nWATCHDOG_MS = 8000  # as long as it may be\n"
+
+        def exec(self, code):
+            exec(code, {})
+
+        def close(self):
+            pass
+
+    monkeypatch.setitem(sys.modules, "machine", Machine)
+    monkeypatch.setattr(device, "connect", lambda port: Board())
+    with device.opened("/dev/ttyACM0"):
+        ((period, callback),) = made
+        callback(None)
+    assert period < 1000 and fed == [8000]
+
+
+def test_a_board_without_a_watchdog_gets_none():
+    class Board:
+        exec = None
+
+        def fs_readfile(self, name):
+            return b"WATCHDOG_MS = 0\n"
+
+    device._feed_watchdog(Board())
+
+
 def test_a_cable_that_is_pulled_out_is_one_line(monkeypatch):
     class Gone:
+        def fs_readfile(self, name):
+            raise OSError(2, "ENOENT")
+
         def close(self):
             raise serial.SerialException("write failed: [Errno 5] Input/output error")
 
@@ -123,6 +174,9 @@ SyntaxError: invalid syntax\r
 """
 
     class Board:
+        def fs_readfile(self, name):
+            raise OSError(2, "ENOENT")
+
         def close(self):
             pass
 

@@ -48,6 +48,22 @@ print(repr((sys.platform, getattr(sys.implementation, '_machine', ''), tuple(sys
 """
 
 
+# At the prompt nobody feeds the firmware's watchdog, which no port can stop
+_FEED = """
+def _feeding():
+    import machine
+    watchdog = machine.WDT(timeout={ms})
+    for number in (-1, 3):
+        try:
+            return machine.Timer(
+                number, period=500, mode=machine.Timer.PERIODIC, callback=lambda timer: watchdog.feed()
+            )
+        except (TypeError, ValueError):
+            pass
+_fed = _feeding()
+"""
+
+
 class DeviceError(Failed):
     """No board, another board than was asked for, or one that cannot do what is needed; says what to do."""
 
@@ -196,6 +212,7 @@ def opened(port: str | None, emulated: bool = False):
     else:
         transport = connect(pick_port(port))
     try:
+        _feed_watchdog(transport)
         yield transport
     except TransportError as why:
         raise DeviceError(_in_a_line(str(why))) from None
@@ -204,6 +221,17 @@ def opened(port: str | None, emulated: bool = False):
     finally:
         with contextlib.suppress(SerialException):
             transport.close()
+
+
+def _feed_watchdog(transport) -> None:
+    """Where board.py has a watchdog: feed it from a timer until the board is restarted."""
+    try:
+        text = transport.fs_readfile("board.py").decode("utf-8", "replace")
+    except OSError:
+        return
+    found = re.search(r"^WATCHDOG_MS *= *([1-9]\d*)", text, re.M)
+    if found:
+        transport.exec(_FEED.format(ms=found[1]))
 
 
 def _in_a_line(said: str) -> str:
