@@ -113,6 +113,8 @@ class AuxiliaryBus:
         Not WAIT_FOR_ES: it would hold back the IMU's own data-ready for a dead magnetometer.
         DELAY_ES_SHADOW: all bytes of one sample appear in EXT_SENS_DATA together.
         """
+        if self.imu.bypass:
+            self.imu.set_bypass(False)
         # a running master may be in the middle of a transfer: only its slots are switched off
         running = self.running
         rows = [] if running else [(_I2C_MST_CTRL, _P_NSR | _CLOCK_400_KHZ, 0xFF)]
@@ -383,16 +385,23 @@ class AuxiliaryDevice(Registers):
         self._bus.imu.attach(None, 0)
         self._bus.begin()
 
-    def attach(self, ext, register, length, trigger, value, every):
-        """Read `length` bytes from register on with every sample, write value to trigger with every n-th, and pass
-        the bytes to ext as imu.attach() says. It uses all slots."""
+    def attach(self, ext, reads, start, every):
+        """Read with every sample, write with every n-th, pass the bytes to ext as imu.attach() says. It uses all slots.
+
+        reads  (register, length) of each read
+        start  (register, value) that is written; None: nothing is
+        """
         bus = self._bus
         self.begin()
-        bus.periodic_read(self.address, register, length)  # at 0: no other slot is in use
-        bus.periodic_write(self.address, trigger, value, every)
+        length = 0
+        for register, n in reads:
+            bus.periodic_read(self.address, register, n)  # the first at 0: no other slot is in use
+            length += n
+        if start is not None:
+            bus.periodic_write(self.address, start[0], start[1], every)
         bus.start()
         bus.faults = 0
-        bus.imu.attach(ext, length)
+        bus.imu.attach(ext, length, (1 << len(reads)) - 1)
 
     @micropython.native
     def transact(self, register, data):

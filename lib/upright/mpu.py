@@ -28,6 +28,7 @@ _PWR_MGMT_1 = const(0x6B)
 _PWR_MGMT_2 = const(0x6C)
 _FIFO_COUNTH = const(0x72)
 
+_I2C_BYPASS_EN = const(0x02)  # INT_PIN_CFG
 _DATA_RDY = const(0x01)  # INT_STATUS and INT_ENABLE
 _FIFO_OFLOW = const(0x10)
 _NO_STATUS = const(0xA4)  # bits of INT_STATUS that no part of the family sets (RM 4.16)
@@ -93,6 +94,7 @@ class Mpu(Counters):
         self.chip = None
         self.who_am_i = None
         self.family_6500 = False
+        self.bypass = False  # see set_bypass()
         self.aux_device = None  # takes the bytes behind the sample
         self.table = RegisterTable(registers)
         self.monitor = Monitor(registers, self.table, counts)
@@ -270,7 +272,7 @@ class Mpu(Counters):
             rows.append((_ACCEL_CONFIG2, filters.accel_config2))
         rows += [
             # never INT_RD_CLEAR: any read would then clear the FIFO overflow flag (RM 4.14)
-            (_INT_PIN_CFG, 0),
+            (_INT_PIN_CFG, self._bypass_bit()),
             (_FIFO_EN, 0),
             (_INT_ENABLE, _DATA_RDY),
         ]
@@ -321,7 +323,7 @@ class Mpu(Counters):
         """Set how the INT pin signals a sample: a pulse of 50 us, or with latch a level until read()."""
         self._need_configured()
         value = (0x80 if active_low else 0) | (0x40 if open_drain else 0) | (0x20 if latch else 0)
-        self.table.set(_INT_PIN_CFG, value)
+        self.table.set(_INT_PIN_CFG, value | self._bypass_bit())
 
     def fifo_enable(self, batch=8):
         """Let the chip queue its samples; read them with fifo_poll() and fifo_next().
@@ -416,6 +418,26 @@ class Mpu(Counters):
         self._need_configured()
         self.table.change_last(bits, mask)
         self.table.set(_USER_CTRL, self.table.last())
+
+    def set_bypass(self, on=True):
+        """Connect the auxiliary bus to the chip's own I2C bus, or separate them (I2C_BYPASS_EN, RM 4.14).
+
+        A magnetometer behind the chip then answers on the bus of the microcontroller. It stays so after configure(),
+        and health() restores it after a reset of the chip. Raises ValueError on SPI, and error_class while an
+        AuxiliaryBus is in use.
+        """
+        if self.port.interface:
+            raise ValueError("bypass needs the chip on I2C; on SPI use an AuxiliaryBus")
+        if on and self._configured and self.master_enabled:
+            raise self.error_class("the auxiliary master is on: configure() ends that")
+        self.bypass = bool(on)
+        if self._configured:
+            row = self.table.numbers.find(bytes((_INT_PIN_CFG,)))
+            value = self.table.values[row] & ~_I2C_BYPASS_EN
+            self.table.set(_INT_PIN_CFG, value | self._bypass_bit())
+
+    def _bypass_bit(self):
+        return _I2C_BYPASS_EN if self.bypass else 0
 
     @property
     def master_enabled(self):

@@ -299,9 +299,11 @@ LIMIT        1  -    LEFT after a measurement
 N            1  -    samples from one measurement to the next
 WAS_READY    1  -    the status said so with the sample before
 X            3  -    the newest measurement
+NEXT         3  -    the one that is being unpacked
 DUE          1  -    calls of read() after which a measurement may be through; 0 behind an IMU
 AGE          1  -    calls of read() since the last one was started
 WAITING      1  -    1: it has not come yet
+LATE         1  -    calls of read() after which it is overdue
 """
 
 
@@ -347,7 +349,6 @@ MODULES = {
     "quaternion_kernels": ("quaternion_kalman", True),
     "quaternion_kalman": ("quaternion_kalman", False),
     "magnetometer": ("magnetometer", True),
-    "ist8310": ("magnetometer", False),
 }
 
 
