@@ -27,8 +27,9 @@ BOXES = {
     "filters": (20, 385, ["upright/filters", "upright/attitude", "upright/fixmath", "upright/*kernels",
                           "upright/inertial", "upright/mahony", "upright/complementary", "upright/*kalman"]),
     "sensors": (330, 500, ["upright/mpu*", "upright/dmp*"]),
-    "magnetometers": (640, 500, ["upright/auxiliary_bus", "upright/magnetometer", "upright/ist8310"]),
-    "buses": (640, 600, ["upright/registers"]),
+    "magnetometers": (640, 500, ["upright/auxiliary_bus", "upright/magnetometer*", "upright/ist8310", "upright/ak8963",
+                                 "upright/hmc5883l", "upright/qmc5883l"]),
+    "buses": (640, 650, ["upright/registers"]),
 }  # fmt: skip
 LIB = "lib/upright"  # the frame around the boxes of that folder
 

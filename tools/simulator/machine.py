@@ -184,6 +184,8 @@ class SoftI2C:
         for candidate in bus.chips:
             if candidate.address == address:
                 chip = candidate
+        if chip is None:
+            chip = _behind(bus.chips, address)
         at = clock.step(10)
         reading = register is None and out is None
         if chip is None or not chip.i2c_start(reading, at):
@@ -210,6 +212,16 @@ class SoftI2C:
             chip.i2c_stop(at)
             clock.finish(1)
             raise _Swallowed if self._bus.swallows else OSError(EIO)
+
+
+def _behind(chips, address):
+    """A chip that another one lets through from its auxiliary bus, or None."""
+    for candidate in chips:
+        if hasattr(candidate, "behind"):
+            chip = candidate.behind(address)
+            if chip is not None:
+                return chip
+    return None
 
 
 class I2C(SoftI2C):

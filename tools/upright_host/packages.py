@@ -23,6 +23,9 @@ TOGETHER = {
     "mpu6500": ("ist8310",),
     "ist8310": ("auxiliary_bus",),
     "magnetometer": ("auxiliary_bus",),
+    "ak8963": ("auxiliary_bus",),
+    "hmc5883l": ("auxiliary_bus",),
+    "qmc5883l": ("auxiliary_bus",),
     "dmp": ("mpu6050",),
     "filters": ("inertial",),
 }

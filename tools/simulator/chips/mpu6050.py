@@ -65,7 +65,7 @@ class MPU6050Chip(Sensors):
     speaks with them; dmp, the Dmp; misuse and log, see Faults.
 
     The digital low-pass filter sets rates only: it does not filter what the world gives. Not
-    simulated: I2C bypass, cycle mode, motion interrupts, the DMP's interrupt, FSYNC, offset registers.
+    simulated: cycle mode, motion interrupts, the DMP's interrupt, FSYNC, offset registers.
     """
 
     # The datasheets say only what a driver must allow, 100 ms; this is less, to be changed at will
@@ -492,6 +492,16 @@ class MPU6050Chip(Sensors):
             self._i2c_disabled = self.family_6500
 
     # I2C
+
+    def behind(self, address):
+        """The chip on the auxiliary bus that answers on this one in bypass (RM 4.14: I2C_MST_EN must be 0), or None."""
+        r = self._registers
+        if self._gone or not r[_INT_PIN_CFG] & 0x02 or r[_USER_CTRL] & 0x20:
+            return None
+        for chip in self.aux:
+            if chip.address == address:
+                return chip
+        return None
 
     def i2c_start(self, read, now):
         self.poll(now)
