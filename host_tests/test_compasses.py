@@ -270,9 +270,9 @@ def test_a_qmc5883l_is_no_ist8310_that_did_not_come_out_of_reset():
 # Bypass
 
 
-def test_bypass_is_a_setting_that_is_kept(rig):
-    if rig.place != "bypass":
-        pytest.skip("the other places have none")
+@pytest.mark.parametrize("name", KINDS)
+def test_bypass_is_a_setting_that_is_kept(name):
+    rig = Rig(name, "bypass")
     rig.start()
     rig.run(2000)
     assert rig.imu.resets == 0
