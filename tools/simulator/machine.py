@@ -33,6 +33,7 @@ class _Bus:
         self.raises = (
             None  # an exception that the next transfer in an interrupt raises: Ctrl-C, a full heap
         )
+        self.timeout_us = 0  # the longest that it was given
         self.failed = {}  # transfers that ended with an error, by address
         self.transfers = 0
         self.bytes = 0
@@ -107,6 +108,7 @@ class SoftI2C:
     def _attach(self, bus, freq, timeout):
         self._bus = bus
         self._timeout = timeout
+        bus.timeout_us = max(bus.timeout_us, _timeout_us(timeout))
         self._freq = freq
         self._clock = _Clock(1000000000 // freq)
 

@@ -262,6 +262,7 @@ def finish(imu, recorder, parts):
         "display_misuse": parts.display.errors,
         "uncaught": len(kernel.uncaught),
         "longest_tick_us": kernel.longest_irq_us,
+        "timeout_us": max([bus.timeout_us for bus in buses]),
         "failed": {str(address): n for bus in buses for address, n in bus.failed.items()},
         "dropped": machine.Timer.dropped,
         "heap_checked": sys.implementation.name == "micropython",
@@ -288,6 +289,7 @@ def finish(imu, recorder, parts):
         angles = array("i", [0] * 3)
         imu.angles_into(angles)
         result["angles_mdeg"] = list(angles)
+        result["period_us"] = 1000000 // imu.settings.FIFO_HZ if status["drive"] == "fifo" else imu.period_us
         result["ticker"] = status["timer"]
         result["drive"] = status["drive"]
         result["faults"] = status["faults"]
