@@ -205,7 +205,7 @@ def test_a_stuck_bus_costs_time_not_the_program(boot):
     result, *_ = boot(seconds=6, faults=[[3 * SECOND, "bus", "low", SECOND]])
     healthy(result)
     assert result["errors"] > 100
-    assert 0 < result["missed"] < 100  # a transfer is given up after 3 ms, so most ticks still come
+    assert result["missed"] == 0  # a transfer is given up after 3 ms, and a tick tries one
     assert result["fresh"] > 700
 
 

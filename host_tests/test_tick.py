@@ -175,10 +175,45 @@ def test_a_timer_rounded_to_microseconds_is_no_missed_tick(imu, filter):
     assert (tick.missed, tick.steps) == (0, 2999)
 
 
-def test_the_steps_made_up_for_at_once_are_bounded_and_all_are_counted(tick, filter):
-    ticks_at(tick, [5000, 5000 + 1000 * PERIOD])
-    assert tick.missed == 999
+def test_the_steps_made_up_for_at_once_are_bounded_and_the_next_ticks_go_on_with_them(tick, filter):
+    ticks_at(tick, [5000, 5000 + 100 * PERIOD])
+    assert tick.missed == 99
     assert len(filter.flags) == 1 + 16 + 1
+    ticks_at(tick, [5000 + (101 + k) * PERIOD for k in range(10)])
+    assert tick.missed == 99
+    assert len(filter.flags) == 1 + 99 + 1 + 10
+    assert filter.flags.count(0) == 99
+
+
+def test_no_more_than_a_second_is_made_up_for(tick, filter):
+    ticks_at(tick, [5000, 5000 + 1000 * PERIOD])
+    ticks_at(tick, [5000 + (1001 + k) * PERIOD for k in range(30)])
+    assert tick.missed == 999
+    assert len(filter.flags) == 1 + 16 + 200 + 1 + 30
+
+
+@pytest.mark.parametrize("took, more", [(2600, 0), (300, 1)])
+def test_after_a_time_out_of_the_bus_nothing_more_is_transferred_in_the_tick(
+    imu, filter, took, more
+):
+    """Each transfer of a stuck bus takes as long. A refused one is quick."""
+    display = Display()
+    tick = Tick(imu, filter, PERIOD, display)
+
+    def fail():
+        kernel.advance(took)
+        imu.counts[10] = 0
+        return 0
+
+    imu.read = fail
+    ticks_at(tick, [5000, 10000, 15000])
+    assert (imu.healths, len(display.asked), len(filter.flags)) == (3 * more, 3 * more, 3)
+
+
+def test_a_tick_that_raised_is_a_step_all_the_same(tick, filter, imu):
+    imu.fail = RuntimeError("broken driver")
+    ticks_at(tick, [5000, 10000])
+    assert (tick.crashes, filter.flags) == (2, [0, 0])
 
 
 def test_a_stale_sample_is_a_coasting_step_and_health_is_looked_at(tick, filter, imu):

@@ -47,8 +47,12 @@ _HEALTH_EVERY = const(8)
 # What health() returns while it restores a chip's registers; and how many of them a slow tick restores at once
 _REPAIRING = const(2)
 _REPAIRS = const(8)
-# Missed ticks that one tick coasts through at most: it bounds the tick, and an older gyro rate means nothing
+# Missed ticks that one tick coasts through at most: it bounds the tick. The next ticks go on with it.
 _MOST_COASTS = const(16)
+# And in all: an older gyro rate means nothing
+_MOST_US = const(1000000)
+# A poll or read of a rare tick that took so long has met a time-out of the bus; one that finds nothing takes 0.2 ms
+_TIME_OUT_US = const(2500)
 
 
 # Attempts to read one set. If 100 steps cut into as many, the tick leaves no time for a program
@@ -192,6 +196,8 @@ class Tick:
         self._due = ticks_us()
         self._started = False
         self._coasted_ahead = 0
+        self._owed = 0  # missed ticks still to be coasted through; then _coasted_ahead is not 0
+        self._stepped = False  # in this tick
         self._running = False
         self._seen = -1
         self._state = array("i", [0] * _WORDS)
@@ -220,13 +226,13 @@ class Tick:
         if self._running:  # another source of the same tick, at a higher priority
             return
         self._running = True
+        self._stepped = False
         try:
             if self._on_time():
                 self._imu.read()
                 if self._mag is not None:
                     self._mag.read(self._raw)
-                self._step()
-                if self._display is not None:
+                if self._step() and self._display is not None:
                     self._display.flush_step(self._chunk)
         except BaseException as error:
             # it must not stop the timer: it is counted, and the main program shows it
@@ -238,18 +244,22 @@ class Tick:
         if self._running:
             return
         self._running = True
+        self._stepped = False
         try:
             imu = self._imu
+            began = ticks_us()
             n = imu.fifo_poll()
-            if n == 0:
+            well = n > 0 or ticks_diff(ticks_us(), began) < _TIME_OUT_US
+            if n == 0 and well:
                 self._look_after()
             while n > 0:
                 imu.fifo_next()  # a packet that is withheld after a reset is still a step: the filter coasts
                 if n == 1 and self._mag is not None:
                     self._mag.read(self._raw)
+                self._stepped = False
                 self._step()
                 n -= 1
-            if self._display is not None:
+            if well and self._display is not None:
                 self._display.flush_step(self._chunk)
         except BaseException as error:
             self._crashed(error)
@@ -264,10 +274,12 @@ class Tick:
         self._running = True
         try:
             if self._state[_STEPS] == self._seen:
+                began = ticks_us()
                 self._imu.read()
-                self._look_after()
-                if self._display is not None:  # it shows that the sensor is lost
-                    self._display.flush_step(self._chunk)
+                if ticks_diff(ticks_us(), began) < _TIME_OUT_US:
+                    self._look_after()
+                    if self._display is not None:  # it shows that the sensor is lost
+                        self._display.flush_step(self._chunk)
             self._seen = self._state[_STEPS]
         except BaseException as error:
             self._crashed(error)
@@ -282,6 +294,16 @@ class Tick:
 
     @micropython.native
     def _crashed(self, error):
+        self._count_crash(error)
+        if not self._stepped:  # a step is always one step
+            try:
+                self._counts[10] &= ~_ANY_FRESH
+                self._filter.update(self._counts)
+            except BaseException as another:
+                self._count_crash(another)
+
+    @micropython.native
+    def _count_crash(self, error):
         if isinstance(error, Exception):
             self.crashes = (self.crashes + 1) & _WRAP
             self.error = error
@@ -307,12 +329,15 @@ class Tick:
             return True
         if late >= period:
             self._coast(late // period)
+            late %= period
             due = self._due
         elif self._coasted_ahead:
             if late < -(period >> 1):
                 self._coasted_ahead -= 1
                 return False
-            if late < period >> 1:
+            if self._owed:
+                self._coast(0)
+            elif late < period >> 1:
                 self._coasted_ahead = 0
         self._due = ticks_add(due, period + (late >> self._phase_gain_shift))
         return True
@@ -320,8 +345,11 @@ class Tick:
     def _coast(self, lost):
         self.missed = (self.missed + lost) & _WRAP
         self._due = ticks_add(self._due, lost * self._period)
-        if lost > _MOST_COASTS:
-            lost = _MOST_COASTS
+        owed = self._owed + lost
+        lost = owed if owed < _MOST_COASTS else _MOST_COASTS
+        owed -= lost
+        most = _MOST_US // self._period
+        self._owed = owed if owed < most else most
         self._coasted_ahead = lost
         self._counts[10] &= ~_ANY_FRESH
         while lost > 0:
@@ -330,16 +358,27 @@ class Tick:
 
     @micropython.native
     def _step(self):
+        """One step of the filter. Returns whether there is time for the display: not after a time-out of the bus, for
+        each further transfer may take as long."""
         counts = self._counts
         if self._calibration is not None:
             self._calibration.apply(self._raw)
         self._filter.update(counts)
         due = _publish(self._state, self._q, counts)
+        self._stepped = True
         if due:
             if due & _CALL_ON_STEP:
                 self._call_on_step()
             if due & _HEALTH_DUE:
+                if not counts[10] & _FRESH and self._period and self._late():
+                    return False
                 self._imu.health()
+        return True
+
+    @micropython.native
+    def _late(self):
+        """Is half of the period over?"""
+        return ticks_diff(self._due, ticks_us()) < self._period >> 1
 
     @micropython.native
     def _call_on_step(self):
@@ -373,7 +412,7 @@ class Tick:
     def resume(self):
         """Call before stopped ticks go on: ticks of the pause are not counted as missed."""
         self._running = self._started = False
-        self._coasted_ahead = 0
+        self._coasted_ahead = self._owed = 0
 
     # -- for programs, interrupts and a second core: nothing here allocates
     @property

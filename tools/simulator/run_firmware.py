@@ -289,7 +289,9 @@ def finish(imu, recorder, parts):
         angles = array("i", [0] * 3)
         imu.angles_into(angles)
         result["angles_mdeg"] = list(angles)
-        result["period_us"] = 1000000 // imu.settings.FIFO_HZ if status["drive"] == "fifo" else imu.period_us
+        result["period_us"] = (
+            1000000 // imu.settings.FIFO_HZ if status["drive"] == "fifo" else imu.period_us
+        )
         result["ticker"] = status["timer"]
         result["drive"] = status["drive"]
         result["faults"] = status["faults"]

@@ -16,6 +16,7 @@ from upright_host import (
     demo,
     dmp,
     doctor,
+    faults,
     flash,
     new_board,
     options,
@@ -64,6 +65,7 @@ for module in (
     score,
     compare,
     demo,
+    faults,
     tune,
     bench,
     packages,
@@ -128,7 +130,7 @@ def list_runtimes(
 _GROUPS = {
     "Your board": ("flash", "doctor", "record", "board", "dmp"),
     "Your data": ("calibrate", "replay", "score", "compare"),
-    "Study, without a board": ("demo", "exec", "tune"),
+    "Study, without a board": ("demo", "faults", "exec", "tune"),
     "Maintain Upright": ("bench", "packages", "runtimes"),
 }
 for command in (*app.registered_commands, *app.registered_groups):

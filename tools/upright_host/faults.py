@@ -6,17 +6,17 @@ without it, and judge() compares both runs.
 
 import json
 import tempfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import typer
 from rich.table import Table
 
-from upright_host import console, library, options, paths, scoring, simulate
+from upright_host import console, library, options, scoring, simulate
 from upright_host.console import Wrong
+from upright_host.fault_plans import PLANS, SECOND, Case
 
-SECOND = 1_000_000
 # The bounds, and docs/reliability.md
 TRANSIENT_US = SECOND  # a fault of up to so long
 SETTLED_US = 2 * SECOND  # is forgotten so long after its end
@@ -28,30 +28,7 @@ PERIODS = 2  # and one time-out of the bus: the longest tick
 RESETS = ("brown_out", "unplugged")
 # While these last there is no sample that could be used.
 BLIND = ("silent", "unplugged", "low", "swallow", "zeros", "frozen", "swapped")
-_MOTIONS = ("spin", "demo", "static")
-
-
-@dataclass
-class Case:
-    """A plan and the board that it happens to. seconds: simulated; they end 2 s after the last fault at least."""
-
-    name: str
-    faults: list
-    seconds: float = 8
-    board_name: str = "sim"
-    board: dict = field(default_factory=dict)
-    motion: str = "spin"
-    options: dict = field(default_factory=dict)  # others of run_firmware.py
-    flash: dict = field(default_factory=dict)  # {name: text} of the board's file system
-    text: str = ""  # what it stands for
-
-    def config(self):
-        return self.options | {
-            "board_name": self.board_name,
-            "board": self.board,
-            "seconds": self.seconds,
-            "frame_ms": 100,
-        }
+STEADY = ("spin", "static")  # motions
 
 
 @dataclass
@@ -63,13 +40,6 @@ class Run:
     times: np.ndarray
     flags: np.ndarray
     q: np.ndarray
-
-
-def world(name: str, seconds: float, path: Path) -> Path:
-    """The .imu file of a motion."""
-    motions = library.simulator("motions")
-    motions.render(name, rate=(1000, 1), seconds=seconds).write(path, truth=True)
-    return path
 
 
 def run(case: Case, runtime: str, world: Path, faulty: bool = True) -> Run:
@@ -98,7 +68,9 @@ def run(case: Case, runtime: str, world: Path, faulty: bool = True) -> Run:
 def ends(faults: list) -> list:
     """[(begin, end or None)] of the faults in their order; a moment ends when it begins."""
     library.simulator("kernel")
-    momentary = {name for name, (_, end, _) in library.simulator("faults").FAULTS.items() if end is None}
+    momentary = {
+        name for name, (_, end, _) in library.simulator("faults").FAULTS.items() if end is None
+    }
     return [
         (at, at if name in momentary else None if lasts is None else at + lasts)
         for at, _, name, lasts, *_ in sorted(faults, key=lambda fault: fault[0])
@@ -118,11 +90,16 @@ def judge(case: Case, run: Run, clean: Run) -> list[str]:
     if not result["started"]:
         return broken
     raised = [fault[4] for fault in faults if fault[2] == "raise"]
-    wanted = sum(name != "KeyboardInterrupt" for name in raised)
-    whole = not result["board_resets"] and not any(fault[2].startswith("raise") for fault in faults)
-    if whole:  # else the counters began anew
+    wanted = sum(
+        name not in ("KeyboardInterrupt", "OSError") for name in raised
+    )  # the latter is a bus error
+    # a new start counts anew, and its yaw begins at 0
+    whole = not result["board_resets"] + result["interrupts"]
+    whole = whole and not any(fault[2] == "raise_in_main" for fault in faults)
+    if whole:
         demand(
-            result["crashes"] == wanted, f"{result['crashes']} crashes of the tick: {result['error']}"
+            result["crashes"] == wanted,
+            f"{result['crashes']} crashes of the tick: {result['error']}",
         )
     demand(result["uncaught"] == 0, f"{result['uncaught']} exceptions left a hard callback")
     demand(result["cuts"] == 0, f"{result['cuts']} transfers were cut")
@@ -137,7 +114,7 @@ def judge(case: Case, run: Run, clean: Run) -> list[str]:
         if end is None:
             _judge_permanent(name, on, begin, result, demand)
         elif end - begin <= TRANSIENT_US:
-            _judge_transient(case, run, clean, (begin, end, following), name, on, demand)
+            _judge_transient(case, run, clean, (begin, end, following), name, on, whole, demand)
     return broken
 
 
@@ -150,7 +127,7 @@ def _judge_permanent(name, on, begin, result, demand):
     demand(shown and shown[0] <= SHOWN_US, f"{name}: {flag} was shown after {shown[:1]} us")
 
 
-def _judge_transient(case, run, clean, span, name, on, demand):
+def _judge_transient(case, run, clean, span, name, on, whole, demand):
     begin, end, following = span
     if on == "imu" and name in RESETS:
         fresh = run.times[(run.flags & 1 > 0) & (run.times > end)]
@@ -161,40 +138,41 @@ def _judge_transient(case, run, clean, span, name, on, demand):
         )
     since = end + SETTLED_US
     if since < following:
-        inclination, yaw = differences(run, clean, since, following)
-        if inclination is None:
+        tilt, yaw = differences(run, clean, since, following)
+        if not len(tilt):
             demand(False, f"{name}: no step is left to compare after {since / SECOND} s")
             return
-        demand(inclination <= OFF_DEG, f"{name}: the inclination is {inclination:.2f} deg off")
-        if case.motion != "demo":
-            demand(yaw <= OFF_DEG, f"{name}: the yaw is {yaw:.2f} deg off")
+        demand(tilt.max() <= OFF_DEG, f"{name}: the inclination is {tilt.max():.2f} deg off")
+        _, before = differences(run, clean, begin - SECOND // 5, begin)
+        if case.motion in STEADY and whole and len(before):
+            # nothing brings a yaw back: what an earlier fault has left is not this one's
+            off = abs((yaw - before[-1] + 180) % 360 - 180).max()
+            demand(off <= OFF_DEG, f"{name}: the yaw is {off:.2f} deg off")
 
 
 def differences(run: Run, clean: Run, since, until):
-    """The largest differences between both runs in that time, degrees: (inclination, yaw); None: nothing to compare."""
-    pick = (run.times >= since) & (run.times < until)
-    if not pick.any() or not len(clean.times):
-        return None, None
+    """How far apart both runs are at each step of that time, degrees: (inclination, yaw)."""
+    last = clean.times[-1] if len(clean.times) else 0
+    pick = (run.times >= since) & (run.times < min(until, last))
+    if not pick.any():
+        return np.empty(0), np.empty(0)
     times, q = run.times[pick], run.q[pick]
-    near = np.clip(np.searchsorted(clean.times, times), 1, len(clean.times) - 1)
-    near -= times - clean.times[near - 1] < clean.times[near] - times
-    # a step apart is the motion of a step: only those that are close in time
-    close = abs(clean.times[near] - times) <= 1000
-    if not close.any():
-        return None, None
-    a, b = q[close], clean.q[near[close]]
-    tilt = np.arccos(np.clip((_up(a) * _up(b)).sum(1), -1, 1))
-    w, x, y, z = _times_conjugate(a, b).T
-    yaw = 2 * np.arctan2(z, w)
-    yaw = abs((yaw + np.pi) % (2 * np.pi) - np.pi)
-    return float(np.degrees(tilt.max())), float(np.degrees(yaw.max()))
+    # the clean run at these times, between two of its steps
+    at = np.clip(np.searchsorted(clean.times, times), 1, len(clean.times) - 1)
+    before, after = clean.q[at - 1], clean.q[at]
+    after = np.where(((before * after).sum(1) < 0)[:, None], -after, after)
+    span = np.maximum(clean.times[at] - clean.times[at - 1], 1)
+    part = ((times - clean.times[at - 1]) / span)[:, None]
+    there = before + part * (after - before)
+    there /= np.linalg.norm(there, axis=1)[:, None]
+    tilt = np.arccos(np.clip((_up(q) * _up(there)).sum(1), -1, 1))
+    w, _, _, z = _times_conjugate(q, there).T
+    return np.degrees(tilt), np.degrees(2 * np.arctan2(z, w))
 
 
 def _up(q):
     w, x, y, z = q.T
-    return np.stack(
-        [2 * (x * z - w * y), 2 * (w * x + y * z), w * w - x * x - y * y + z * z], 1
-    )
+    return np.stack([2 * (x * z - w * y), 2 * (w * x + y * z), w * w - x * x - y * y + z * z], 1)
 
 
 def _times_conjugate(a, b):
@@ -210,3 +188,93 @@ def _times_conjugate(a, b):
         ],
         1,
     )
+
+
+class Rig:
+    """Runs cases on a runtime and judges them. folder: for the worlds. A run without faults serves all of its kind."""
+
+    def __init__(self, runtime: str, folder: Path):
+        self._runtime, self._folder, self._clean = runtime, folder, {}
+
+    def world(self, case: Case) -> Path:
+        path = self._folder / f"{case.motion}-{case.seconds}.imu"
+        if not path.exists():
+            motions = library.simulator("motions")
+            motions.render(case.motion, rate=(1000, 1), seconds=case.seconds).write(path)
+        return path
+
+    def clean(self, case: Case) -> Run:
+        """The run without the faults."""
+        key = repr((case.config(), case.motion, case.flash))
+        if key not in self._clean:
+            self._clean[key] = run(case, self._runtime, self.world(case), False)
+        return self._clean[key]
+
+    def examine(self, case: Case) -> tuple[Run, list[str]]:
+        """-> the run with its faults, and the bounds that it broke."""
+        faulty = run(case, self._runtime, self.world(case))
+        return faulty, judge(case, faulty, self.clean(case))
+
+
+_COUNTERS = "missed crashes step_errors errors resets full_resets fifo_overflows display_errors"
+
+
+def _counted(result) -> str:
+    """The counters that are not 0."""
+    names = [*_COUNTERS.split(), "mag_errors", "mag_resets", "interrupts", "board_resets"]
+    return ", ".join(f"{name} {result[name]}" for name in names if result.get(name))
+
+
+def _cases(names, file) -> list[Case]:
+    if file:
+        try:
+            faults = json.loads(file.read_text())
+            library.simulator("faults").check(faults)
+        except (OSError, ValueError) as why:
+            raise Wrong(f"{file}: {why}") from None
+        last = max((begin if end is None else end for begin, end in ends(faults)), default=0)
+        return [Case(file.name, faults, seconds=max(8, last / SECOND + 4))]
+    unknown = [name for name in names or () if name not in PLANS]
+    if unknown:
+        raise Wrong(f"no plan {', '.join(unknown)}; `upright faults --list` names them")
+    return [PLANS[name] for name in names or PLANS]
+
+
+def register(app: typer.Typer) -> None:
+    """Give an app the command `faults`."""
+
+    @app.command("faults")
+    def faults_command(
+        names: list[str] = typer.Argument(None, help="Plans by their name (default: all)."),
+        file: Path = typer.Option(
+            None, help="A plan of your own: JSON, a list of [at_us, on, fault, for_us, value...]."
+        ),
+        show: bool = typer.Option(False, "--list", help="Name the plans and stop."),
+        runtime: str = options.runtime(),
+    ):
+        """Break the simulated board in every known way while the firmware runs, and hold it to bounds."""
+        cases = _cases(names, file)
+        if show:
+            table = Table(box=None, pad_edge=False)
+            for column in ("plan", "what happens", "as data"):
+                table.add_column(column)
+            for case in cases:
+                table.add_row(case.name, case.text, json.dumps(case.faults))
+            console.out.print(table)
+            return
+        runtime = runtime or simulate.best_runtime()
+        failed = 0
+        with tempfile.TemporaryDirectory() as folder:
+            rig = Rig(runtime, Path(folder))
+            for case in cases:
+                faulty, broken = rig.examine(case)
+                verdict = "ok" if not broken else "known" if case.gap else "BROKEN"
+                failed += verdict == "BROKEN"
+                console.say(
+                    f"{verdict:<7}{case.name}: {_counted(faulty.result) or 'nothing counted'}"
+                )
+                for line in broken:
+                    console.say(f"       {line}{f' ({case.gap})' if case.gap else ''}")
+        console.say(f"{len(cases)} plans on {runtime}, {failed} broke a bound")
+        if failed:
+            raise typer.Exit(console.FAILED)

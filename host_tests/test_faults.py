@@ -1,0 +1,180 @@
+"""What breaks on real desks, done to the firmware on a simulated board: the plans, random ones, and those kept.
+
+The bounds are in upright_host/faults.py.
+"""
+
+import json
+from pathlib import Path
+
+import hypothesis
+import pytest
+from hypothesis import strategies as st
+from upright_host import faults, library, simulate
+from upright_host.fault_plans import PLANS, SECOND, Case
+
+# Random plans that broke a bound, shrunk; what they found is mended
+KEPT = json.loads((Path(__file__).parent / "fault_plans.json").read_text())
+FAULTS = library.simulator("faults")
+
+
+@pytest.fixture(scope="session")
+def rig(tmp_path_factory):
+    return faults.Rig(simulate.best_runtime(), tmp_path_factory.mktemp("worlds"))
+
+
+@pytest.mark.parametrize("name", PLANS)
+def test_every_plan_is_within_the_bounds(name, rig):
+    case = PLANS[name]
+    _, broken = rig.examine(case)
+    if broken and case.gap:
+        pytest.xfail(case.gap)
+    assert broken == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", ["brown-out", "sda-low", "nack-burst", "masked-long", "main-raises"]
+)
+def test_a_plan_comes_out_the_same_on_every_runtime(name, rig, runtime):
+    case = PLANS[name]
+    there, here = [faults.run(case, each, rig.world(case)) for each in (runtime, "cpython")]
+    assert (there.q == here.q).all()
+    keys = ("steps", "fresh", "missed", "crashes", "errors", "resets", "changes")
+    assert [there.result[key] for key in keys] == [here.result[key] for key in keys]
+
+
+def test_every_fault_is_in_a_plan():
+    used = {fault[2] for case in PLANS.values() for fault in case.faults}
+    assert used == set(FAULTS.FAULTS)
+
+
+@pytest.mark.parametrize(
+    "plan, said",
+    [
+        ({}, "a plan is a list"),
+        ([[1, "imu", "nack"]], "is not .at_us"),
+        ([[1, "imu", "naked", None]], "no fault 'naked'"),
+        ([[1, "mag", "zeros", None]], "zeros can be on imu"),
+        ([[-1, "imu", "nack", None]], "whole microseconds"),
+        ([[1, "imu", "nack", 0.5]], "whole microseconds"),
+        ([[1, "imu", "swapped", None, 0x70]], "another chip comes after"),
+    ],
+)
+def test_a_plan_that_is_none_is_refused_with_a_reason(plan, said, upright, tmp_path):
+    with pytest.raises(ValueError, match=said):
+        FAULTS.check(plan)
+    file = tmp_path / "plan.json"
+    file.write_text(json.dumps(plan))
+    done = upright("faults", "--file", file)
+    assert done.exit_code == 2
+    assert "Traceback" not in done.output
+
+
+def test_the_command_runs_plans_by_name_and_from_a_file_and_names_them(upright, tmp_path):
+    done = upright("faults", "nack", "sda-low")
+    assert done.exit_code == 0
+    assert "2 plans" in done.output
+    file = tmp_path / "own.json"
+    file.write_text('[[3000000, "imu", "silent", 100000], [5500000, "board", "masked", 20000]]')
+    done = upright("faults", "--file", file)
+    assert done.exit_code == 0
+    assert "errors" in done.output
+    assert "brown-out" in upright("faults", "--list").output
+    assert upright("faults", "no-such-plan").exit_code == 2
+
+
+# -- the bounds can be broken: each has a run that breaks it
+
+
+def broken(rig, case, **changed):
+    faulty, _ = rig.examine(case)
+    faulty.result.update(changed)
+    return " ".join(faults.judge(case, faulty, rig.clean(case)))
+
+
+@pytest.mark.parametrize(
+    "changed, said",
+    [
+        ({"started": False}, "never started"),
+        ({"crashes": 1}, "crashes of the tick"),
+        ({"uncaught": 1}, "left a hard callback"),
+        ({"cuts": 1}, "were cut"),
+        ({"longest_tick_us": 10**6}, "a tick took 1000000 us"),
+    ],
+)
+def test_a_bound_that_is_broken_is_named(changed, said, rig):
+    assert said in broken(rig, PLANS["silent"], **changed)
+
+
+def test_a_permanent_fault_that_nobody_shows_is_named(rig):
+    assert "sensor_lost was shown" in broken(rig, PLANS["gone"], changes=[])
+
+
+def test_an_attitude_that_stays_off_is_named(rig):
+    case = PLANS["silent"]
+    faulty, _ = rig.examine(case)
+    faulty.q[faulty.times > 5 * SECOND] = [0.9, 0.3, 0.3, 0.1]
+    said = " ".join(faults.judge(case, faulty, rig.clean(case)))
+    assert "the inclination is" in said
+    assert "the yaw is" in said
+
+
+# -- random plans
+
+QUIET = int(2.5 * SECOND)  # between two faults
+
+
+def moment(name, on, *values):
+    return st.tuples(st.just(on), st.just(name), st.none(), *values)
+
+
+def lasting(name, on, *values, most=SECOND):
+    return st.tuples(st.just(on), st.just(name), st.integers(1000, most), *values)
+
+
+FAULT = st.one_of(
+    moment("nack", "imu", st.integers(1, 30), st.integers(0, 20)),
+    moment("nack", "display", st.integers(1, 30), st.integers(0, 40)),
+    lasting("silent", "imu"),
+    lasting("silent", "display"),
+    lasting("unplugged", "display"),
+    moment("jam", "imu"),
+    moment("raise", "bus", st.sampled_from(["ValueError", "MemoryError", "OSError"])),
+    moment("raise_in_on_step", "board", st.sampled_from(["ValueError", "MemoryError"])),
+    lasting("low", "bus", st.sampled_from(["sda", "scl"])),
+    lasting("masked", "board"),
+    lasting("no_ticks", "board"),
+    lasting("hang", "board"),
+    lasting("disk_full", "board"),
+    moment("flip", "imu", st.sampled_from([0x19, 0x1A, 0x37, 0x38, 0x6A, 0x6B]), st.just(0x40)),
+)
+
+
+@st.composite
+def plans(draw):
+    at, plan = 3 * SECOND, []
+    for fault in draw(st.lists(FAULT, min_size=1, max_size=4)):
+        at += draw(st.integers(0, 20000))
+        plan.append([at, *fault])
+        at += (fault[2] or 0) + QUIET
+    return plan
+
+
+def bounds_hold(plan, drive, rig):
+    case = Case("random", plan, seconds=16, board={"DRIVE": drive})
+    run, wrong = rig.examine(case)
+    assert wrong == [], (drive, plan)
+    assert not run.result["changes"] or not run.result["changes"][-1][2], "it is lost for ever"
+
+
+@pytest.mark.slow
+@hypothesis.settings(max_examples=25, suppress_health_check=list(hypothesis.HealthCheck))
+@hypothesis.given(plan=plans())
+def test_random_plans_are_within_the_bounds(plan, rig):
+    """What breaks is shrunk by hypothesis: put it into fault_plans.json."""
+    bounds_hold(plan, "timer", rig)
+
+
+@pytest.mark.parametrize("drive, plan", KEPT)
+def test_what_random_plans_found_stays_mended(drive, plan, rig):
+    bounds_hold(plan, drive, rig)
