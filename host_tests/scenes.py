@@ -4,7 +4,7 @@ import math
 
 import motions
 import numpy as np
-from histories import ONE, SCALE
+from histories import ONE, SCALES
 
 # (rate, every so many samples with a fresh magnetometer)
 PACES = [(90, 1), (200, 3), (500, 10)]
@@ -24,11 +24,15 @@ def scene(
     range_g=16,
     mag_every=1,
     accel_offset_g=(0.004, -0.003, 0.006),
+    range_dps=2000,
+    mag_offset_uT=(0, 0, 0),
+    noise=1,
 ):
     """A motion from level and north as the counts of a noisy sensor, flags included.
 
-    body_rate(t): deg/s (n, 3); accel(t): g, earth (n, 3); field(t): uT on top, earth (n, 3); kick: (s, rotation vector
-    in deg, earth): the body is elsewhere from then on, and the gyro has not seen it.
+    body_rate(t): deg/s (n, 3); accel(t): g, earth (n, 3); field(t): uT on top, earth (n, 3); bias_dps: also a function
+    of t; kick: (s, rotation vector in deg, earth): the body is elsewhere from then on, and the gyro has not seen it;
+    mag_offset_uT: in the body; noise: so many times that of a usual sensor.
     """
     n = int(rate * seconds)
     t = np.arange(n) / rate
@@ -49,16 +53,19 @@ def scene(
     force = np.einsum("nij,ni->nj", turn, (accel(t) if accel else still) + [0, 0, 1])
     mag = np.einsum("nij,ni->nj", turn, FIELD_UT + (field(t) if field else still))
     rng = np.random.default_rng(1)
-    gyro = gyro + np.array(bias_dps) + 0.07 * rng.standard_normal((n, 3))
-    force = force + accel_offset_g + 0.005 * rng.standard_normal((n, 3))
-    mag = mag + 0.6 * rng.standard_normal((n, 3))
+    bias = bias_dps(t) if callable(bias_dps) else np.array(bias_dps)
+    read = gyro + bias + 0.07 * noise * rng.standard_normal((n, 3))
+    force = force + accel_offset_g + 0.005 * noise * rng.standard_normal((n, 3))
+    mag = mag + mag_offset_uT + 0.6 * noise * rng.standard_normal((n, 3))
+    scale = SCALES[range_dps]
     counts = np.zeros((n, 11), np.int16)
     counts[:, 0:3] = motions._to_int16(force * (32768 // range_g))
-    counts[:, 3:6] = motions._to_int16(gyro * 16.4)
+    counts[:, 3:6] = motions._to_int16(read * (scale[0] / scale[1]))
     counts[:, 6:9] = motions._to_int16(mag / 0.3)
-    full = (np.abs(counts[:, 0:3].astype(int)) >= 32767).any(1)
-    counts[:, 10] = np.where(np.arange(n) % mag_every == 0, 3, 1) + 4 * full
-    return motions.Motion("scene", counts, q, gyro, (rate, 1), 32768 // range_g, SCALE)
+    full = np.abs(counts[:, 0:6].astype(int)) >= 32767
+    counts[:, 10] = np.where(np.arange(n) % mag_every == 0, 3, 1)
+    counts[:, 10] += (4 * full[:, :3].any(1) + 8 * full[:, 3:].any(1)).astype(np.int16)
+    return motions.Motion("scene", counts, q, gyro, (rate, 1), 32768 // range_g, scale)
 
 
 def errors(q, rendered):
