@@ -1,18 +1,14 @@
 """What holds for every filter of the registry: that the firmware runs with it; test_attitude.py has the interface."""
 
-import dataclasses
 import hashlib
 import sys
 
 import dmp_images
-import numpy as np
 import pytest
 from conftest import healthy
 from samples import SOFTWARE, Scales
-from scenes import errors, scene
-from trial_files import as_trial
 from upright import filters
-from upright_host import registry, replay, scoring, simulate
+from upright_host import registry, simulate
 
 
 def test_an_unknown_name_is_refused_with_those_that_there_are():
@@ -114,46 +110,3 @@ def test_settings_that_a_dmp_cannot_keep_are_refused(boot_board, tmp_path, chang
     config = dmp_board(tmp_path, dmp_images.V612, **change)
     with pytest.raises(simulate.SimulationError, match=r"rate_hz 30|DRIVE is \"timer\""):
         boot_board(seconds=2, **config)
-
-
-# -- started in the middle of a motion
-def thrown(seed):
-    """45 s at 200 Hz of turns and pushes in bursts, from the first sample on, and a raw gyro; no magnet near."""
-    rng = np.random.default_rng(seed)
-    size, hz, phase = (
-        rng.uniform(0, 1, (3, 4)),
-        rng.uniform(0.05, 1.5, (3, 4)),
-        rng.uniform(0, 6, (3, 4)),
-    )
-    push, push_hz = rng.uniform(0.2, 0.6), rng.uniform(0.3, 4, (3, 3))
-    ends = np.cumsum(rng.uniform(2, 12, 40))
-
-    def active(t):
-        return np.searchsorted(ends, t) % 2 == 0
-
-    def body_rate(t):
-        wave = np.sin(2 * np.pi * hz[..., None] * t + phase[..., None])
-        return (active(t) * 150 * (size[..., None] * wave).sum(1)).T
-
-    def accel(t):
-        wave = np.sin(2 * np.pi * push_hz[..., None] * t + phase[:, :3, None])
-        return (active(t) * push / 2 * wave.sum(1)).T
-
-    return scene(200, 45, body_rate, accel, tuple(rng.uniform(-5, 5, 3)))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", ["inertial6", "inertial9", "quaternion-kalman6", "quaternion-kalman9"]
-)
-@pytest.mark.parametrize("seed", [1, 2, 3, 4, 5, 6])
-def test_a_start_in_the_middle_of_a_motion_is_forgotten(name, seed):
-    motion = thrown(seed)
-    trial = dataclasses.replace(as_trial(motion), mag_uT_per_lsb=0.3)
-    q = replay.replay(trial, name, simulate.best_runtime(), direct=True).q29 / scoring.ONE
-    inclination, heading = errors(q, motion)
-    late = 200 * 25
-    print(f"{name} {seed}: {inclination[late:].max():.1f} {np.abs(heading[late:]).max():.1f}")
-    assert inclination[late:].max() < 4
-    if registry.axes(name) == 9:
-        assert np.abs(heading[late:]).max() < 10
