@@ -20,6 +20,8 @@ RUNAWAY = 16  # an innovation of the velocity was beyond 2.5 sigma
 UNDER = 32  # upside down while wide
 LEAN = 64  # wide, and still off by much
 UPSET = 128  # at rest and tilted: cannot be
+ADOPT = 512  # the rest shows another bias than what was taken for one
+TILTED = 1024  # one so far off that the tilt is wrong, too
 DOUBTED = 256  # so little is known of the heading that the magnetometer is believed as it is
 
 DEFAULTS = {
@@ -46,7 +48,10 @@ LEAN_VARIANCE = 0.1225  # rad**2, (20 deg)**2
 WIDE_FOR = 0.4  # s
 CAP = 0.64  # rad**2
 FOLD = 0.35  # rad
-BIAS_MOST = 2.5  # of bias_start
+BIAS_MOST = 25.0  # deg/s
+REST_OFF = 0.3  # deg/s
+PRIOR = 10.0  # deg/s per root Hz
+TURNED = math.radians(3)
 REST_TAU = 0.25  # s
 FIELD_SMOOTH = 0.05  # s
 FIELD_TAU, FIELD_TAU_FAR = 20.0, 100.0  # s
@@ -80,6 +85,7 @@ class QuaternionKalmanFloat(EarthFloat):
         self.r_velocity = (p["velocity_noise"] / GRAVITY) ** 2 / T**3
         self.r_mag = p["mag_noise"] ** 2 / T
         self.r_rest = (p["rest_noise"] * dps) ** 2 / T / 3
+        self.r_prior = (PRIOR * dps) ** 2 / self.T / 48
         self.q_turn = (p["gyro_noise"] * math.radians(1)) ** 2 * T
         self.q_bias = (p["bias_walk"] * dps) ** 2 * T
         self.q_scale = (p["scale_error"] * self.gyro) ** 2 * T  # of a count of rate
@@ -87,7 +93,9 @@ class QuaternionKalmanFloat(EarthFloat):
         self.base = [0.0, 0.0, 0.0]
         self.low1, self.low2 = [0.0] * 6, [0.0] * 6
         self.blocks = self.still = 0
-        self.axis = 0
+        self.axis = self.wait = self.tipped = self.clip = 0
+        self.seen = 0.0  # heading error
+        self.good = False
         self.field = self.reference = None
         self.near = self.field_age = self.lost_mag = 0
         self.decided = self.disagreed = 0
@@ -96,14 +104,16 @@ class QuaternionKalmanFloat(EarthFloat):
         self.set_bias([0.0] * 3)
         self.set_quaternion([1.0, 0.0, 0.0, 0.0])
 
-    def set_bias(self, counts):
+    def set_bias(self, counts, known_s=0):
         for i in range(3):
             self.low1[3 + i] += self.base[i] - counts[i]
             self.low2[3 + i] += self.base[i] - counts[i]
         self.base = list(counts)
         self.b = np.zeros(3)
+        variance = 1 / (1 / self.bias_start + known_s / (3 * self.T * self.r_rest))
         for i in range(3, 6):
-            self.open(i, self.bias_start)
+            self.open(i, variance)
+        self.wait = 0
 
     def set_quaternion(self, q, seeded=False):
         """seeded: from a sample, so that tilt and heading are known to a few degrees; "level": the tilt alone."""
@@ -116,7 +126,7 @@ class QuaternionKalmanFloat(EarthFloat):
         self.gyro_sum, self.accel_sum = [0] * 3, [0] * 3
         self.phase = 1  # the first block is a whole one
         self.turn = None
-        self.since, self.lost, self.lost_mag, self.wide_for = 0, 0, 0, 0
+        self.since, self.lost, self.lost_mag, self.wide_for, self.clip = 0, 0, 0, 0, 0
         self.young = int(self.p["bias_after"] / self.T + 0.5)
         self.open(0, SEEDED**2 if seeded else OPEN**2)
         self.open(1, SEEDED**2 if seeded else OPEN**2)
@@ -149,6 +159,7 @@ class QuaternionKalmanFloat(EarthFloat):
         if not fresh:
             return
         self.forced = decisions
+        self.clip += bool(counts[10] & 8)
         R = self.R = rows(self.q)
         a = counts[0:3]
         for i in range(3):
@@ -178,7 +189,7 @@ class QuaternionKalmanFloat(EarthFloat):
         x[7] -= x[0]
         self.fold = [clamp(v, FOLD) for v in x[0:3]]
         x[0:3] -= self.fold
-        most = BIAS_MOST * self.p["bias_start"] * self.dps
+        most = BIAS_MOST * self.dps
         for i in range(3):
             self.b[i] = clamp(self.b[i] + x[3 + i], most)
         for i in range(2):
@@ -194,10 +205,20 @@ class QuaternionKalmanFloat(EarthFloat):
         self._tilt()
         if self.axes == 9:
             self._heading()
-        self.axis = (self.axis + 1) % 3
+        self.axis = (self.axis + 1) % 48
+        i = self.axis % 3
         if rest:
-            z = self.low2[3 + self.axis] * self.gyro * self.T
-            self._measure(3 + self.axis, z - self.b[self.axis], self.r_rest)
+            off = self.low2[3 + i] * self.gyro * self.T - self.b[i]
+            tilted = self.decide(TILTED, abs(off) > 4 * REST_OFF * self.dps)
+            if self.decide(ADOPT, abs(off) > REST_OFF * self.dps):
+                self.open(3 + i, self.bias_start)
+                self.b[i] += off
+                off = 0.0
+            if tilted:
+                self._reopen()
+            self._measure(3 + i, off, self.r_rest)
+        elif self.axis < 3 and self.axes == 6:
+            self._measure(3 + i, -self.b[i], self.r_prior)
 
     def _propagate(self):
         """P of the error after the block: turn += -R bias, then velocity += turn x up."""
@@ -211,8 +232,14 @@ class QuaternionKalmanFloat(EarthFloat):
         scale = self.q_scale * sum(v * v for v in self.g)
         for i in range(3):
             P[i, i] += self.q_turn + (scale / 16 if i == 2 else scale)
+            if self.clip and P[i, i] < OPEN**2:
+                most = self.clip * 32768 * self.gyro * self.dt / 2
+                P[i, i] = min(OPEN**2, P[i, i] + most**2)
             if P[3 + i, 3 + i] < self.bias_start:
                 P[3 + i, 3 + i] += self.q_bias
+        if self.clip:
+            self.wide_for = min(1, self.wide_for)
+            self.clip = 0
         for i in (0, 1, 2, 6, 7):
             if P[i, i] > (CAP if i < 3 else CAP * 1024):
                 P[i, :] /= 2
@@ -251,17 +278,34 @@ class QuaternionKalmanFloat(EarthFloat):
             size[i // 3] += (v - self.low2[i]) ** 2
         still = size[0] < (self.p["rest_accel_g"] * self.lsb) ** 2
         still = still and size[1] < (self.p["rest_gyro_dps"] * self.gyro_scale) ** 2
+        contradicted = wait = False
         for i in range(3):
             z = self.low2[3 + i] * self.gyro * self.T
-            still = still and abs(z) <= 2.5 * self.p["bias_start"] * self.dps
-            if self.P[3 + i, 3 + i] < (0.1 * self.dps) ** 2:
-                still = still and abs(z - self.b[i]) <= 0.5 * self.dps
+            base = self.base[i] * self.gyro * self.T
+            still = still and abs(z) <= BIAS_MOST * self.dps
+            off = abs(z - self.b[i]) / self.dps
+            if self.P[3 + i, 3 + i] < (0.1 * self.dps) ** 2 and off > REST_OFF:
+                contradicted = True
+                if abs(z + base) >= abs(self.b[i] + base):
+                    wait = True
+                    still = still and off <= 8 * REST_OFF
+        if still and contradicted:
+            self.wait += 1
+            if self.wait >= 7 * self.whole(self.p["rest_after"]):
+                wait = False
+            still = not wait and not (self.good and abs(self.seen) < TURNED)
+        else:
+            self.wait = 0
         self.still = self.still + 1 if self.decide(STILL, still) else 0
         after = self.whole(self.p["rest_after"])
         rest = self.still >= after
         self.still = min(self.still, after)
-        if self.decide(UPSET, rest and math.hypot(*self.h[:2]) > 0.25):
+        force = sum(v * v for v in self.h)
+        tipped = rest and math.hypot(*self.h[:2]) > 0.25 and 0.95 < force < 1.05
+        self.tipped = self.tipped + 1 if tipped else 0
+        if self.decide(UPSET, self.tipped == 8):
             self._reopen()
+            self.tipped = 0
         return rest
 
     def _reopen(self):
@@ -302,9 +346,9 @@ class QuaternionKalmanFloat(EarthFloat):
             return
         north, west, up = (v / self.m_n for v in self.m)
         j, self.since = self.since, 0
+        e = self.seen = math.atan2(-west, north)
         if self.unlevel:
             return
-        e = math.atan2(-west, north)
         now = (math.hypot(north, west), up)
         if self.field is None:
             self.field, self.reference = list(now), list(now)

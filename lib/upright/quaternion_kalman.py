@@ -13,6 +13,8 @@ from upright.quaternion_kernels import (
     add_noise,
     after_tilt,
     carry_errors,
+    contradicted,
+    count_rest,
     forget,
     measure,
     measure_rest,
@@ -100,7 +102,10 @@ _GOOD = const(254)
 _FIRST = const(255)
 _YOUNG = const(257)
 _AFTER = const(258)
-_WORDS = const(259)
+_WAIT = const(259)
+_CLIP = const(260)
+_RP = const(261)
+_WORDS = const(263)
 # -- end of the words
 
 _PI28 = const(105414357 << 3)  # quaternion_kernels' pi, Q25
@@ -109,11 +114,46 @@ _WIDE = const(8)
 _RUNAWAY = const(16)
 _UPSET = const(128)
 _NOT_BY_MAG = const(0xC3)  # tilt and velocity
+_ADOPT = const(512)
+_TILTED = const(1024)
 _BIAS = const(0x38)
 _FOLD_W = const(651000000)  # half of sqrt(3) 0.35 rad, Q31
 _SEEDED = const(47099587)  # (12 deg)**2, Q30: of an attitude from one sample
 _HEADING_START = const(8177247)  # (5 deg)**2: of a heading that is relative
+_BIAS_MOST = const(25)  # deg/s: largest learnt bias
+_FINEST = const(800000)  # 1e-6 deg/s: B holds 25 deg/s in the unit of this first sigma
+_PRIOR = const(10)  # deg/s per root Hz: of the bias being 0, with six axes
 _SIGMA = const(26000)  # first sigma of the bias in P's units, no more
+
+
+@micropython.viper
+def measure_bias(state):
+    """One axis of the gyro's bias: from rest; or, with six axes and now and then, that it is near 0."""
+    s = ptr32(state)
+    j = s[_AXIS] + 1
+    if j == 48:
+        j = 0
+    s[_AXIS] = j
+    i = j % 3
+    s[_UH] = 3 + i
+    s[_UM] = 0
+    if s[_STILL] == s[_REST_AFTER]:
+        j = int(contradicted(state, i))
+        if j & _ADOPT:
+            # it is taken over as it is: an innovation would be bounded
+            forget(state, 3 + i, s[_BS])
+            s[_B + i] = s[_Z + i]
+            s[_UE] = 0
+        if j & _TILTED:
+            forget(state, 0, _OPEN)
+            forget(state, 1, _OPEN)
+        s[_UR] = s[_RR]
+        measure(state)
+    elif j < 3 and s[_NINE] == 0:
+        # without a heading nothing shows the vertical bias but rest: it stays near 0
+        s[_UE] = 0 - s[_B + i]
+        s[_UR] = s[_RP]
+        measure(state)
 
 
 @micropython.viper
@@ -135,7 +175,7 @@ def work(state, n: int):
         if s[_YOUNG]:
             s[_YOUNG] -= 1
         low_pass(state, _IN + 3)
-        measure_rest(state)
+        count_rest(state, int(measure_rest(state)))
         if s[_DECIDED] & _UPSET:
             forget(state, 0, _OPEN)
             forget(state, 1, _OPEN)
@@ -145,16 +185,7 @@ def work(state, n: int):
             elif s[_J]:
                 weigh_field(state)
     elif n == 7:
-        i = s[_AXIS] + 1
-        if i == 3:
-            i = 0
-        s[_AXIS] = i
-        if s[_STILL] == s[_REST_AFTER]:
-            s[_UE] = s[_Z + i] - s[_B + i]
-            s[_UH] = 3 + i
-            s[_UR] = s[_RR]
-            s[_UM] = 0
-            measure(state)
+        measure_bias(state)
     elif n == 6:
         if s[_NINE]:
             i = int(ready_for_heading(state))
@@ -223,8 +254,11 @@ class QuaternionKalman9(EarthFilter):
 
     parameters        by name, see PARAMETERS; taken to six significant digits
 
-    Limits: a long push (0.3 g for 5 s) is taken for a tilt. A turn that the gyro has not measured is corrected at once
-    at rest, but takes up to 15 s in motion. A steady rotation from power-on looks like a bias and is taken for one.
+    Limits: a very long push (0.3 g for 10 s) is taken for a tilt. A turn that the gyro has not measured is corrected at
+    once at rest, but takes up to 15 s in motion. A steady rotation from power-on, up to 25 deg/s, looks like a bias and
+    is taken for one. Later a rest that contradicts a known bias by more than 0.3 deg/s is adopted after 1.5 s
+    (rest_after) if the new value is nearer to 0, else after 8 times that, and not at all beyond 2.4 deg/s; with a good
+    field only if the heading is off by more than 3 deg. With six axes a turn of less than that is taken for a bias.
 
     Raises ValueError for a rate, scale or parameter that the numbers cannot hold, with the range that they can:
     60 to 1439 Hz at +-2000 deg/s, from 50 Hz on at +-1000 deg/s and less.
@@ -247,7 +281,7 @@ class QuaternionKalman9(EarthFilter):
         "accel_noise": (0.1, 0.02, 1),
         "velocity_noise": (1.1, 0.1, 2),  # m/s per root Hz
         "mag_noise": (0.15, 0.01, 0.2),  # of the heading, rad per root Hz
-        # first sigma of the bias (on top of set_bias), which is no larger than 2.5 of them, deg/s
+        # first sigma of the bias (on top of set_bias), deg/s
         "bias_start": (3.3, 0.5, 10),
         # before this time only rest shows the bias, s: after a start in motion the corrections are those of a wrong
         # attitude, not of a bias
@@ -265,7 +299,7 @@ class QuaternionKalman9(EarthFilter):
 
     # -- set-up and main loop: allocates
     def bounds(self, p):
-        return 25 * MILLION, _FOLD_W
+        return _BIAS_MOST * MILLION, _FOLD_W
 
     def set_up(self, p, given):
         # every variance stays below 2**30
@@ -295,13 +329,13 @@ class QuaternionKalman9(EarthFilter):
             )
         # the bias: 2**-c rad a block
         c = 16
-        while squared(p["bias_start"] * rad, MILLION * degrees, 2, 2 * c + 2) <= _SIGMA**2:
+        most = max(p["bias_start"], _FINEST)
+        while squared(most * rad, MILLION * degrees, 2, 2 * c + 2) <= _SIGMA**2:
             c += 1
         s[_C] = c - 15
         s[_B_SHIFT] = c + shift - 20
         s[_BS] = squared(p["bias_start"] * rad, MILLION * degrees, 2, 2 * c)
-        most = p["bias_start"] * 5 * rad * t << (c + 9)  # 2.5 sigma
-        s[_B_MOST] = min((1 << 30) - 1, ratio(most, MILLION * degrees * num))
+        s[_B_MOST] = ratio(_BIAS_MOST * rad * t << (c + 10), degrees * num)
         s[_AFTER] = blocks(p["bias_after"])
         # noise of a block
         s[_QT] = squared(p["gyro_noise"] * rad, MILLION * degrees, 1, 46)
@@ -318,10 +352,12 @@ class QuaternionKalman9(EarthFilter):
         s[_RM] = squared(p["mag_noise"], MILLION, -1, 26)
         r = ratio(squared(p["rest_noise"] * rad, MILLION * degrees, 1, 2 * c), 48)
         s[_RR] = min(max(r, 256), 1 << 29)
+        r = ratio(squared(_PRIOR * rad, degrees, 1, 2 * c), 16 * 48)
+        s[_RP] = min(max(r, 256), 1 << 29)
         s[_V0] = squared(5, 100, -2, 20)
         # rest
-        s[_REST_MOST] = counts(p["bias_start"] * 5 // 2, 4096)
-        s[_REST_OFF] = ratio(rad * t << (c + 9), degrees * num)
+        s[_REST_MOST] = counts(_BIAS_MOST * MILLION, 4096)
+        s[_REST_OFF] = ratio(3 * rad * t << (c + 10), 10 * degrees * num)
         s[_KNOWN] = squared(rad, 10 * degrees, 2, 2 * c)
         s[_CB], s[_CB_SHIFT] = fine_mantissa(
             (rad * per * t) << (c + 10), (degrees * scale * num) << 12, 15
@@ -344,7 +380,7 @@ class QuaternionKalman9(EarthFilter):
         for first, n in ((_HS, 3), (_AS, 3), (_GS, 3), (_X, 8), (_V, 2)):
             for i in range(n):
                 s[first + i] = 0
-        for i in (_WIDE_FOR, _LOST, _FAR):
+        for i in (_WIDE_FOR, _LOST, _FAR, _CLIP):
             s[i] = 0
         s[_YOUNG] = s[_AFTER]
         s[_STAGE] = 8  # the block in work belongs to the old attitude
@@ -362,8 +398,15 @@ class QuaternionKalman9(EarthFilter):
         self.state[_P + (0, 8, 15, 21, 26, 30, 33, 35)[i]] = variance
 
     def bias_is_new(self, known_s):
+        s = self.state
+        first = s[_BS]
+        # rest measures each axis every third block, with 16 RR
+        num, den = self.rate
+        rests = fixmath.ratio(int(known_s * 1000) * num, 3000 * den << s[_BLOCK])
+        variance = max(16, fixmath.ratio(16 * first * s[_RR], 16 * s[_RR] + first * rests))
         for i in range(3):
-            self._open(3 + i, self.state[_BS])
+            self._open(3 + i, variance)
+        s[_WAIT] = 0
 
     @property
     def bias_unit(self):
@@ -398,7 +441,8 @@ class QuaternionKalman9(EarthFilter):
 
         With bit 0 of flags (word 10) clear (no fresh sample) the filter turns with the last gyro words, without
         feedback, and all estimates stay unchanged. Bit 1: the magnetometer's words are fresh; its rate may be as low as
-        a tenth of the steps'. Bits 2 and 3 (full scale) change nothing: leaving such samples out would be worse.
+        a tenth of the steps'. Bit 2 (accelerometer at full scale) changes nothing: leaving such samples out would
+        be worse. Bit 3 (gyro): the variances grow by what may be missing.
         """
         state = self.state
         s = ptr32(state)
@@ -420,6 +464,8 @@ class QuaternionKalman9(EarthFilter):
         w = (s[_OR + 2] << k >> k) + o * fine + s[_WR + 2]
         fresh = c[10] & 1
         if fresh:
+            if c[10] & 8 and s[_CLIP] < 100:
+                s[_CLIP] += 1
             s[_GS] = (s[_GS] << k >> k) + n
             s[_GS + 1] = (s[_GS + 1] << k >> k) + m
             s[_GS + 2] = (s[_GS + 2] << k >> k) + o

@@ -17,6 +17,7 @@ from micropython import const
 
 # -- words of the state: written by tools/upright_host/words.py
 _PROBE = const(0)  # always -1, see fixmath.py
+_G = const(15)  # Q31: half angle per step of one gyro count
 _O = const(17)  # 3, Q31: minus the bias as a half angle per step
 _OR = const(20)  # 3, Q46: its last bits, -32767..32767
 _TURN = const(23)  # 3, Q31: correction that the next step takes up, earth frame, half angle
@@ -30,6 +31,7 @@ _DECIDED = const(54)  # yes/no decisions, for the tests' float twin
 _GS = const(55)  # 3: gyro counts summed over the block
 _MS = const(58)  # 3, Q9: magnetometer in the earth frame, counts, summed over the block
 _MN = const(61)  # samples in it
+_SINCE = const(62)  # blocks since the last with a magnetometer sample, no more than 16
 _J = const(63)  # blocks that the heading of this block stands for; 0: none
 _HEADING = const(64)  # Q28: heading error, rad
 _NOW = const(65)  # 2, Q13: horizontal and vertical field, counts
@@ -100,6 +102,9 @@ _FAR_MOST = const(253)  # blocks
 _GOOD = const(254)  # 1: the field is that of the reference; 2: there is no reference yet
 _FIRST = const(255)  # blocks after which there is one
 _NOISE = const(256)  # variance / 16 of the heading
+_WAIT = const(259)  # blocks of a rest that a known bias contradicts
+_CLIP = const(260)  # steps of the block with the gyro at full scale, no more than 100
+_TIPPED = const(262)  # blocks of a rest in which the force is 1 g, but not along the vertical
 # -- end of the words
 
 _STILL_BIT = const(1)
@@ -111,6 +116,8 @@ _UNDER = const(32)
 _LEAN = const(64)
 _UPSET = const(128)
 _DOUBTED = const(256)
+_ADOPT = const(512)
+_TILTED = const(1024)
 
 _CAP = const(687194767)  # 0.64 of the largest variance, Q30
 OPEN = const(603979776)  # variance of an attitude of which nothing is known: (0.75 rad)**2
@@ -120,6 +127,7 @@ _LEAN_ONE = const(131533373)  # (20 deg)**2, Q30
 _FOLD_MOST = const(11744051)  # 0.35 rad, Q25
 _V_MOST = const(1072693248)  # 1023, Q20
 _FAR_RAD = const(18454938)  # 0.55, Q25
+_TURNED = const(14055000)  # 3 deg, Q28
 _PI25 = const(105414357)
 _LEAST = const(16)  # no variance falls below
 
@@ -379,6 +387,25 @@ def add_noise(s: ptr32):
     s[_P] += x + m
     s[_P + 8] += x + m
     s[_P + 15] += x + (m >> 4)
+    # full scale: every such step may have turned by half as much again, up to all that can be unknown
+    n = s[_CLIP]
+    if n:
+        s[_CLIP] = 0
+        n = n * s[_G] >> 8
+        if n > 192:
+            n = 192
+        n = n * n << 14
+        if s[_WIDE_FOR] > 1:
+            s[_WIDE_FOR] = 1  # as after a start
+        i = 0
+        while i < 3:
+            o = _P + at[9 * i]
+            if s[o] < OPEN:
+                x = s[o] + n
+                if x > OPEN:
+                    x = OPEN
+                s[o] = x
+            i += 1
     # P_bb += bias_walk**2 T, up to the first variance
     x = s[_QBR] + s[_QB]
     s[_QBR] = x & 4095
@@ -530,16 +557,18 @@ def measure(s: ptr32):
 
 # ------------------------------------------------------------------------------------------ what is measured
 @micropython.viper
-def measure_rest(s: ptr32):
-    """STILL: for how long gyro and accelerometer have stayed near their low-passes, the gyro near a well-known bias.
+def measure_rest(s: ptr32) -> int:
+    """Whether gyro and accelerometer stay near their low-passes, 1 or 0.
 
-    Z: the low-passed gyro, which measures the bias then. At rest a tilt error that cannot be is UPSET.
+    Z: the low-passed gyro, which measures the bias then. Where it contradicts a well-known bias, either may be wrong.
     """
     k = 0
     if s[_PROBE] > 0:
         k = 32
     at = ptr8(_AT)
-    # still: |IN - LOW2| small, |gyro| <= REST_MOST, and |Z - B| <= REST_OFF where the variance of B is below KNOWN
+    # still: |IN - LOW2| small, |gyro| <= REST_MOST, and no contradiction: |Z - B| > REST_OFF where B's variance is
+    # below KNOWN
+    wait = 0
     still = s[_AWAY] < s[_REST_ACCEL] and s[_AWAY + 1] < s[_REST_GYRO]
     i = 0
     while i < 3:
@@ -561,12 +590,54 @@ def measure_rest(s: ptr32):
         else:
             v = h + (v >> 13) >> f - 13
         s[_Z + i] = v
-        v -= s[_B + i] << k >> k
-        if v < 0:
-            v = 0 - v
-        if s[_P + at[27 + 9 * i]] < s[_KNOWN] and v > s[_REST_OFF]:
-            still = False
+        h = s[_B + i] << k >> k
+        f = v - h
+        if f < 0:
+            f = 0 - f
+        if f > s[_REST_OFF] and s[_P + at[27 + 9 * i]] < s[_KNOWN]:
+            wait |= 1
+            # nearer to a gyro without bias: it was a turn that was taken for one
+            h = s[_O + i] << k >> k
+            v = (s[_Z + i] << k >> k >> s[_B_SHIFT]) - (s[_O_BASE + i] << k >> k)
+            if h < 0:
+                h = 0 - h
+            if v < 0:
+                v = 0 - v
+            if v >= h:
+                wait |= 2
+                if f > s[_REST_OFF] << 3:
+                    still = False
         i += 1
+    if still and wait:
+        # a bias has to be contradicted for 8 rests, if it is not nearer to 0 then; where the field is good, the heading
+        # has to be off as well: else the body turns
+        h = s[_WAIT] + 1
+        if h >= s[_REST_AFTER] * 7:
+            h = s[_REST_AFTER] * 7
+            wait &= 1
+        v = s[_HEADING] << k >> k
+        if s[_GOOD] == 1 and s[_SINCE] < 16 and v < _TURNED and v > 0 - _TURNED:
+            wait |= 2
+        s[_WAIT] = h
+        if wait & 2:
+            still = False
+    else:
+        s[_WAIT] = 0
+    i = 0
+    if still:
+        i = 1
+    return i
+
+
+@micropython.viper
+def count_rest(s: ptr32, still: int):
+    """STILL: for how many blocks it has been still; this one is (1) or not (0).
+
+    At rest a tilt error that cannot be is UPSET: the force is 1 g, and not along the vertical.
+    """
+    k = 0
+    if s[_PROBE] > 0:
+        k = 32
     decided = (s[_DECIDED] | (_STILL_BIT | _UPSET)) ^ _UPSET
     i = 0
     if still:
@@ -576,13 +647,41 @@ def measure_rest(s: ptr32):
     else:
         decided ^= _STILL_BIT
     s[_STILL] = i
-    # upset: at rest, and |(H0, H1)| > 1/4 g
-    x = (s[_H] << k >> k) >> 10
-    v = (s[_H + 1] << k >> k) >> 10
+    # upset: at rest for 8 blocks |(H0, H1)| > 1/4 g, and |H|**2 within 5 % of 1 g, which that of a push is not
+    f = 0
     if i == s[_REST_AFTER]:
-        if x > 256 or x < -256 or v > 256 or v < -256 or x * x + v * v > 65536:
-            decided |= _UPSET
+        x = (s[_H] << k >> k) >> 10
+        v = (s[_H + 1] << k >> k) >> 10
+        h = (s[_H + 2] << k >> k) >> 10
+        if x < 2048 and x > -2048 and v < 2048 and v > -2048 and h < 2048 and h > -2048:
+            x = x * x + v * v
+            h = x + h * h
+            if x > 65536 and h > 996147 and h < 1101004:
+                f = s[_TIPPED] + 1
+                if f == 8:
+                    f = 0
+                    decided |= _UPSET
+    s[_TIPPED] = f
     s[_DECIDED] = decided
+
+
+@micropython.viper
+def contradicted(s: ptr32, i: int) -> int:
+    """UE: what the rest says of bias i. ADOPT: it is another one; TILTED: so far off that the tilt is wrong too."""
+    k = 0
+    if s[_PROBE] > 0:
+        k = 32
+    x = (s[_Z + i] << k >> k) - (s[_B + i] << k >> k)
+    s[_UE] = x
+    if x < 0:
+        x = 0 - x
+    decided = (s[_DECIDED] | (_ADOPT | _TILTED)) ^ (_ADOPT | _TILTED)
+    if x > s[_REST_OFF]:
+        decided |= _ADOPT
+        if x > s[_REST_OFF] << 2:
+            decided |= _TILTED
+    s[_DECIDED] = decided
+    return decided
 
 
 @micropython.viper

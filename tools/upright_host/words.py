@@ -240,7 +240,7 @@ RM           1  -    ... heading from one block ...
 RR           1  -    ... bias at rest ...
 RA           1  -    ... accelerometer used as measured
 V0           1  -    first variance of the velocity
-AXIS         1  -    of the bias that is measured at rest
+AXIS         1  -    0..47; modulo 3: axis of the bias that is measured at rest
 Z            3  -    low-passed gyro in B's units
 REST_OFF     1  -    most that a known bias may be off, B's units
 KNOWN        1  -    variance of a known bias
@@ -268,6 +268,10 @@ FIRST        1  -    blocks after which there is one
 NOISE        1  -    variance / 16 of the heading
 YOUNG        1  -    blocks until motion shows the bias
 AFTER        1  -    the same at the start
+WAIT         1  -    blocks of a rest that a known bias contradicts
+CLIP         1  -    steps of the block with the gyro at full scale, no more than 100
+RP           1  -    variance / 16: of a bias being 0
+TIPPED       1  -    blocks of a rest in which the force is 1 g, but not along the vertical
 """
 
 
