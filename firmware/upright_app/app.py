@@ -12,6 +12,10 @@ from upright_app import pages
 
 _FRAME_MS = const(100)
 _RETRY_MS = const(1000)
+# The faults are kept in this file, for the doctor: so long after the first one, and not more often than that
+FAULTS = "upright_faults.txt"
+_KEEP_AFTER_MS = const(5000)
+_KEEP_EVERY_MS = const(600000)
 # What machine.reset_cause() may give: each port has some of these names.
 _CAUSES = (
     ("PWRON_RESET", "power-on"),
@@ -47,6 +51,9 @@ class App:
         self._reported = 0
         self._watchdog = None
         self._fed_at = 0  # fresh samples when the watchdog was last fed
+        self._cause = ""
+        self._kept = 0  # entries of the black box that are in the file
+        self._fault_at = self._kept_at = None
         self._restarted = None  # what the first message of a start says about the one before
 
     def run(self):
@@ -54,15 +61,19 @@ class App:
         self.tell_cause()
         self.start()
         self.start_watchdog()
-        while True:
-            try:
-                self.poll()
-                machine.idle()
-            except Exception as why:
-                self.recover(why)
+        try:
+            while True:
+                try:
+                    self.poll()
+                    machine.idle()
+                except Exception as why:
+                    self.recover(why)
+        except KeyboardInterrupt:
+            self.keep_faults()
+            raise
 
     def tell_cause(self):
-        cause = reset_cause()
+        self._cause = cause = reset_cause()
         print("started by:", cause)
         if cause == "watchdog":
             self._restarted = "watchdog reset"
@@ -91,6 +102,7 @@ class App:
             print("stopped by %r; starting again" % why)
             try:
                 self.imu.stop()
+                self.keep_faults()
                 self.say("Starting again", repr(why))
                 time.sleep_ms(_RETRY_MS)
                 self.imu.start()
@@ -130,8 +142,45 @@ class App:
             if status["crashes"] != self._reported:
                 self._reported = status["crashes"]
                 print("tick: %d exceptions, last: %r" % (self._reported, status["error"]))
+            self._watch_faults(now, status["at_rest"] is not False or status["sensor_lost"])
             if not busy:
                 self._draw(now, status)
+
+    def _watch_faults(self, now, idle):
+        """Keep new faults, rarely, and not in motion: a write to the flash blocks everything for some hundredths of a
+        second on most boards."""
+        if self.imu.black_box.total == self._kept:
+            self._fault_at = None
+        elif self._fault_at is None:
+            self._fault_at = now
+        elif idle and time.ticks_diff(now, self._fault_at) >= _KEEP_AFTER_MS:
+            kept = self._kept_at
+            if kept is None or time.ticks_diff(now, kept) >= _KEEP_EVERY_MS:
+                self._kept_at = now
+                self.keep_faults()
+
+    def keep_faults(self):
+        """Write the last faults into the file, if there are new ones."""
+        entries = self.imu.faults()
+        if self.imu.black_box.total == self._kept:
+            return
+        self._kept = self.imu.black_box.total
+        try:
+            with open(FAULTS, "w") as file:
+                file.write(
+                    "written %d s after the clock's start; started by: %s\n"
+                    % (time.ticks_ms() // 1000, self._cause)
+                )
+                for name, count, first, last in entries:
+                    file.write(
+                        "%.1f s before: %s %d, over %.1f s\n" % (last, name, count, first - last)
+                    )
+        except OSError as why:
+            print("faults: not kept:", why)
+        self.imu.faults()
+        self._kept = (
+            self.imu.black_box.total
+        )  # ticks that the write has cost are no reason for another one
 
     def _draw(self, now, status):
         seconds = self.imu.settings.PAGE_SECONDS

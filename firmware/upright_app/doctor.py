@@ -26,6 +26,17 @@ class _Counter:
         self.n += 1
 
 
+def _report_faults():
+    """What the application has noted: no problem of now."""
+    try:
+        with open("upright_faults.txt") as file:
+            print("faults of the last run that had any (upright_faults.txt):")
+            for line in file:
+                print(" ", line.rstrip())
+    except OSError:
+        print("faults: none kept")
+
+
 def report(board):
     """Print which chips answer, which rates are kept, how much memory is free. Returns the list of problems, each with
     what to do."""
@@ -36,6 +47,7 @@ def report(board):
     gc.collect()
     if hasattr(gc, "mem_free"):
         print("heap: %d bytes free" % gc.mem_free())
+    _report_faults()
     try:
         settings = Settings(of_board(board))
         settings.check(9 if hasattr(board, "magnetometer") else 6)

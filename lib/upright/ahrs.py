@@ -1,6 +1,6 @@
 # AHRS: sensor, calibration, filter and tick as one object that a program holds; attitude and heading in degrees.
-# Needs bias.py, calibration.py, filters.py and the module of its filter, reading.py, settings.py, tick.py, timing.py,
-# trim.py. Every port. Set-up and readings may allocate and use floats; what the tick runs does neither.
+# Needs bias.py, black_box.py, calibration.py, filters.py and the module of its filter, reading.py, settings.py,
+# tick.py, timing.py, trim.py. Every port. Set-up and readings may allocate and use floats; what the tick runs may not.
 
 import time
 from array import array
@@ -12,6 +12,7 @@ from upright import calibration as calibrations
 from upright import filters
 from upright import tick as ticks
 from upright.bias import Bias
+from upright.black_box import BlackBox
 from upright.reading import Reading
 from upright.settings import DEFAULTS, FIFO_BATCH, Settings, of_board
 
@@ -131,6 +132,7 @@ class AHRS:
         self.ticker = None
         self._guard = None
         self.bias = Bias(self)
+        self.black_box = BlackBox(_FAULTS.split())
         self.notes = []  # what start() could not do, in a few words each
         # what is taken from the yaw, and from the yaw with its full turns, millidegrees
         self.yaw_zero = (0, 0)
@@ -451,7 +453,9 @@ class AHRS:
             self._own_mag,
             self._on_step,
             self,
+            self.black_box,
         )
+        self.black_box.watch(self._counters())
         tick.seeded()
         if display is not None and self._display_found:
             while display.busy:  # from here on the tick owns the bus
@@ -460,6 +464,19 @@ class AHRS:
             self.sensor.fifo_enable(FIFO_BATCH)
         elif self.drive == "data_ready":
             self.sensor.configure_interrupt()
+
+    def _counters(self):
+        """Where each counter of faults is: {name: (object, attribute)}."""
+        found = {
+            name: (self.sensor, name) for name in _FAULTS.split() if hasattr(self.sensor, name)
+        }
+        for name in ("missed", "crashes", "step_errors"):
+            found[name] = (self.tick, name)
+        for part, name in ((self.display, "display"), (self.magnetometer, "magnetometer")):
+            for attribute in ("errors", "resets"):
+                if hasattr(part, attribute):
+                    found[name + "_" + attribute] = (part, attribute)
+        return found
 
     # ------------------------------------------------------------------------------------ for programs
 
@@ -618,6 +635,12 @@ class AHRS:
         found["faults"] = sum([found[name] for name in _FAULTS.split() if name in found])
         return found
 
+    def faults(self):
+        """The last 32 faults, oldest first, also of former starts: a list of (counter of status(), how many, seconds
+        since the first of them, seconds since the last)."""
+        self.black_box.look()
+        return self.black_box.entries()
+
     def refresh_display(self):
         """Send a chunk to a display on its own bus, from the main loop as often as possible. Returns whether more is
         left; False without a display."""
@@ -656,6 +679,7 @@ class AHRS:
                 and hasattr(self.filter, "resting")
             ):
                 self.bias.keep((passed + 500) // 1000)
+            self.black_box.look()  # the display's and the magnetometer's; all others the tick notes at once
             if self._filter_in_sensor and self.sensor.needs_reload:
                 self._reload()
         return tick.steps

@@ -168,6 +168,7 @@ class Tick:
     calibration       None: the filter gets the driver's raw counts
     mag               a magnetometer on a bus of its own, which the tick owns; None if it comes with the sample
     on_step           called with `argument` after each step; the rules of a hard interrupt hold for it
+    black_box         its look() is called after what is no fresh sample, a missed tick, or an exception
     """
 
     def __init__(
@@ -182,6 +183,7 @@ class Tick:
         mag=None,
         on_step=None,
         argument=None,
+        black_box=None,
     ):
         self._imu = imu
         self._filter = filter
@@ -207,6 +209,7 @@ class Tick:
         self._num, self._den = num, 1000 * den  # counts per mdeg/s
         self._on_step = on_step
         self._argument = argument
+        self._black_box = black_box
         # the quaternion of each set, for a reader that may not allocate
         self._sets = [
             memoryview(self._state)[at : at + 4] for at in (_SETS, _SETS + SNAPSHOT_WORDS)
@@ -250,8 +253,11 @@ class Tick:
             began = ticks_us()
             n = imu.fifo_poll()
             well = n > 0 or ticks_diff(ticks_us(), began) < _TIME_OUT_US
-            if n == 0 and well:
-                self._look_after()
+            if n == 0:
+                if well:
+                    self._look_after()
+                if self._black_box is not None:
+                    self._black_box.look()
             while n > 0:
                 imu.fifo_next()  # a packet that is withheld after a reset is still a step: the filter coasts
                 if n == 1 and self._mag is not None:
@@ -280,6 +286,8 @@ class Tick:
                     self._look_after()
                     if self._display is not None:  # it shows that the sensor is lost
                         self._display.flush_step(self._chunk)
+                if self._black_box is not None:
+                    self._black_box.look()
             self._seen = self._state[_STEPS]
         except BaseException as error:
             self._crashed(error)
@@ -301,6 +309,8 @@ class Tick:
                 self._filter.update(self._counts)
             except BaseException as another:
                 self._count_crash(another)
+        if self._black_box is not None:
+            self._black_box.look()
 
     @micropython.native
     def _count_crash(self, error):
@@ -329,6 +339,8 @@ class Tick:
             return True
         if late >= period:
             self._coast(late // period)
+            if self._black_box is not None:
+                self._black_box.look()
             late %= period
             due = self._due
         elif self._coasted_ahead:
@@ -370,10 +382,19 @@ class Tick:
             if due & _CALL_ON_STEP:
                 self._call_on_step()
             if due & _HEALTH_DUE:
-                if not counts[10] & _FRESH and self._period and self._late():
-                    return False
+                if not counts[10] & _FRESH:
+                    return self._without_sample()
                 self._imu.health()
         return True
+
+    @micropython.native
+    def _without_sample(self):
+        well = not self._period or not self._late()
+        if well:
+            self._imu.health()
+        if self._black_box is not None:
+            self._black_box.look()
+        return well
 
     @micropython.native
     def _late(self):
@@ -388,6 +409,8 @@ class Tick:
             if isinstance(error, Exception):
                 self.step_errors = (self.step_errors + 1) & _WRAP
                 self.step_error = error
+                if self._black_box is not None:
+                    self._black_box.look()
             else:
                 self.interrupt = error
 
