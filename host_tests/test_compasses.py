@@ -10,7 +10,7 @@ from chips.hmc5883l import HMC5883LChip
 from chips.ist8310 import IST8310Chip
 from chips.qmc5883l import QMC5883LChip
 from imus import RIGS
-from upright import magnetometers
+from upright import magnetometers, settings
 from upright.ak8963 import AK8963, AK8963Error
 from upright.auxiliary_bus import AuxiliaryBus
 from upright.hmc5883l import HMC5883L, HMC5883LError
@@ -438,11 +438,26 @@ def test_what_is_there_instead_is_said():
     ):
         magnetometers.find(rig.imu)
     assert not rig.imu.bypass and not rig.imu.master_enabled
+    assert magnetometers.find(rig.imu, "QMC5883L").own_bus and rig.imu.bypass
     with pytest.raises(ValueError, match="magnetometer 'BMM150' is not one of auto, HMC5883L"):
         magnetometers.find(rig.imu, "BMM150")
 
 
+@pytest.mark.parametrize("place", ["spi", "behind"])
+def test_a_named_one_that_is_silent_at_the_start_is_found_by_the_tick(place):
+    rig = Rig("AK8963", place)
+    rig.mag_chip.vanish()
+    rig.mag = magnetometers.find(rig.imu, "AK8963")
+    with pytest.raises(AK8963Error, match="no AK8963 at 0x0c"):
+        rig.configure()
+    rig.mag.attach()
+    assert rig.run(200) == []
+    rig.mag_chip.come_back()
+    assert rig.until(MAG_FRESH) < 500_000
+
+
 def test_the_table_of_the_search_is_the_drivers():
+    assert sorted(magnetometers.NAMES) == sorted(settings.MAGNETOMETERS)
     for name, addresses, register, identity in magnetometers.CHIPS:
         driver = magnetometers.driver(name)
         assert driver.chip == name

@@ -15,6 +15,8 @@ DISKS = {
     "pico": ("VfsLfs2", 4096, 352),
     "pico2": ("VfsLfs2", 4096, 640),
     "pico2_w": ("VfsLfs2", 4096, 640),
+    "gy87_pico": ("VfsLfs2", 4096, 352),
+    "mpu9250_pico": ("VfsLfs2", 4096, 352),
     "pico_w": ("VfsLfs2", 4096, 212),
     "pyboard": ("VfsFat", 512, 224),
     "robomaster_a": ("VfsFat", 512, 512),

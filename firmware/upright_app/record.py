@@ -136,8 +136,8 @@ def _open(board, rate_hz):
     print("sensor: %s, %d/%d Hz" % ((imu.chip,) + imu.sample_rate))
     if not hasattr(board, "magnetometer"):
         return imu, None
-    mag = board.magnetometer(imu)
     try:
+        mag = board.magnetometer(imu)
         mag.configure(rate_hz=min(settings.MAG_RATE_HZ, rate_hz), sample_rate=imu.sample_rate)
         print("magnetometer: %s, %d/%d Hz" % ((mag.chip,) + mag.sample_rate))
         return imu, mag

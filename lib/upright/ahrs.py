@@ -55,7 +55,8 @@ def from_board(module, **settings):
         raise ValueError("board.py has no sensor(), which returns the driver of the IMU")
     found = of_board(module)
     for name in found:
-        options[name.lower()] = found[name]
+        if name != "MAGNETOMETER":  # the board's own function knows it
+            options[name.lower()] = found[name]
     options.update(settings)
     return AHRS(module.sensor(), **options)
 
@@ -66,7 +67,8 @@ class AHRS:
     sensor        a driver: MPU6050(i2c), MPU6500(spi, select), ...
     rate          steps per second: int, or (num, den) for num/den Hz
     filter        its name in filters.py; None: inertial9 with a magnetometer, else inertial6
-    magnetometer  a driver, or a function that takes the sensor's driver and returns one
+    magnetometer  a driver; a function that takes the sensor's driver and returns one; or what to look for beside the
+                  sensor: "auto", or a name as in magnetometers.py
     drive         "timer", "fifo", "data_ready" or "manual"; None: timer where timers are hard, else fifo
     timer         None: the best timer of the port; a timer's number; or a make_tick(rate, callback) as in timing.py
     calibration   the name of the calibration file, see calibration.py; None: no corrections
@@ -109,6 +111,8 @@ class AHRS:
         if on_step is not None and not callable(on_step):
             raise TypeError("on_step is a function that takes the AHRS, not %r" % (on_step,))
         given = {"RATE": rate, "FILTER": filter, "DRIVE": drive, "CALIBRATION": calibration}
+        if isinstance(magnetometer, str):
+            given["MAGNETOMETER"] = magnetometer
         for name in settings:
             given[name.upper()] = settings[name]
         self.settings = Settings(given)
@@ -210,7 +214,7 @@ class AHRS:
                 wrong.append("%s is %r, expected %s" % (name, part, wanted))
 
         mag, timer = self._magnetometer, self._timer
-        if mag is not None and not callable(mag):
+        if mag is not None and not callable(mag) and not isinstance(mag, str):
             demand("magnetometer", mag, "configure own_bus", "a driver or a function")
         if self.display is not None:
             demand("display", self.display, "begin flush_step", "one of upright/ssd1306.py")
@@ -350,7 +354,16 @@ class AHRS:
         if mag is None:
             return
         sensor, settings = self.sensor, self.settings
-        mag = mag(sensor) if callable(mag) else mag
+        try:
+            if isinstance(mag, str):
+                find = __import__("upright.magnetometers", None, None, ("find",)).find
+                mag = find(sensor, mag)
+            elif callable(mag):
+                mag = mag(sensor)
+        except OSError as why:
+            self.log("magnetometer:", why)
+            self.notes.append("no magnetometer")
+            return
         if not hasattr(mag, "own_bus"):
             raise ValueError("magnetometer() returned %r, expected a driver" % (mag,))
         self.magnetometer = mag

@@ -27,6 +27,7 @@ def find(imu, wanted="auto"):
 
     On I2C the IMU's auxiliary bus is connected to its own (imu.set_bypass()), so that the magnetometer answers there.
     The bypass stays on if it is needed. On SPI, or where nothing answers in bypass, the auxiliary master looks for it.
+    Where nothing answers at all, a chip that was named is taken to be behind the IMU: the tick finds it when it does.
     Raises MagnetometerNotFound, ValueError for a name that is none.
     """
     if wanted != "auto" and wanted not in NAMES:
@@ -50,7 +51,12 @@ def find(imu, wanted="auto"):
     found = _look(aux.device, wanted, others)
     if found is not None:
         return driver(found[0])(aux, found[1])
+    if wanted != "auto" and not others and bus is None:
+        return driver(wanted)(aux)
     imu.set_user_ctrl(0, 0x20)  # I2C_MST_EN
+    if wanted != "auto" and not others:
+        imu.set_bypass()
+        return driver(wanted)(bus)
     what = "magnetometer" if wanted == "auto" else wanted
     places = ", ".join(
         [

@@ -23,6 +23,8 @@ DEFAULTS = {
     # How the chips are mounted: body x, y, z (forward, left, up) each as an axis of the chip, "x", "-y", ...
     "IMU_AXES": ("x", "y", "z"),
     "MAG_AXES": ("x", "y", "z"),
+    # Which magnetometer magnetometers.find() looks for: "auto" or one of MAGNETOMETERS.
+    "MAGNETOMETER": "auto",
     # The magnetometer's rate, if board.py has one.
     "MAG_RATE_HZ": 100,
     # Corrections and biases, see calibration.py; made by `upright calibrate`. None: no file.
@@ -53,6 +55,7 @@ DEFAULTS = {
     "WATCHDOG_MS": 0,
 }
 
+MAGNETOMETERS = ("AK8963", "HMC5883L", "IST8310", "QMC5883L")
 DRIVES = ("timer", "data_ready", "fifo", "manual")
 FIFO_BATCH = 8  # packets that one tick of the FIFO drive fetches at most
 _NO_SETTINGS = ("NAME", "PLATFORM")
@@ -108,6 +111,8 @@ class Settings:
         drives = self.DRIVE is None or self.DRIVE in DRIVES
         self._demand(wrong, "DRIVE", drives, ", ".join(['"%s"' % name for name in DRIVES]))
         self._demand(wrong, "FIFO_HZ", is_int(self.FIFO_HZ, 1, 1000), "Hz as an int, 1..1000")
+        good = self.MAGNETOMETER == "auto" or self.MAGNETOMETER in MAGNETOMETERS
+        self._demand(wrong, "MAGNETOMETER", good, '"auto", "%s"' % '", "'.join(MAGNETOMETERS))
         self._demand(wrong, "MAG_RATE_HZ", is_int(self.MAG_RATE_HZ, 1), "Hz as a positive int")
         good = self.SENSOR_RATE_HZ is None or is_int(self.SENSOR_RATE_HZ, 1)
         self._demand(wrong, "SENSOR_RATE_HZ", good, "Hz as a positive int, or None")

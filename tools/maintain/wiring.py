@@ -22,9 +22,16 @@ _PICO = {
     "SCL": "GP5, pin 7",
     "INT": "GP6, pin 9",
 }
+# Modules in place of the GY-521: {folder: (name, {signal: its pin})}
+MODULES = {
+    "gy87_pico": ("GY-87 or GY-86", {"3V3": "3.3V", "INT": "INTA"}),
+    "mpu9250_pico": ("MPU9250 (GY-9250)", {}),
+}
 # folder: (name, {signal: what is printed at the board's pin})
 BOARDS = {
     "pico": ("Raspberry Pi Pico", _PICO),
+    "gy87_pico": ("Raspberry Pi Pico", _PICO),
+    "mpu9250_pico": ("Raspberry Pi Pico", _PICO),
     "pico_w": ("Raspberry Pi Pico W", _PICO),
     "pico2": ("Raspberry Pi Pico 2", _PICO),
     "pico2_w": ("Raspberry Pi Pico 2 W", _PICO),
@@ -54,11 +61,12 @@ BOARDS = {
 def draw(folder: str) -> str:
     """The picture as SVG text."""
     name, pins = BOARDS[folder]
+    module, renamed = MODULES.get(folder, ("MPU6050 (GY-521)", {}))
     out = [
         '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 720 330" font-family="sans-serif">',
         '<rect width="720" height="330" fill="#ffffff"/>',
         _box(20, 20, 200, 290, "#1e6f50", name),
-        _box(500, 20, 200, 150, "#2e4a7d", "MPU6050 (GY-521)"),
+        _box(500, 20, 200, 150, "#2e4a7d", module),
         _box(500, 190, 200, 120, "#3b3b3b", "SSD1306 128x64"),
     ]
     for i, (signal, (colour, imu, oled)) in enumerate(_SIGNALS.items()):
@@ -66,7 +74,7 @@ def draw(folder: str) -> str:
         lane = 270 + 40 * i
         at = 62 + 23 * i
         out.append(_wire(colour, [(220, y), (lane, y), (lane, at), (500, at)], signal == "INT"))
-        out.append(_pin(510, at, imu, "start"))
+        out.append(_pin(510, at, renamed.get(signal, imu), "start"))
         if oled:
             below = 234 + 22 * i
             out.append(_wire(colour, [(lane, y), (lane, below), (500, below)], False))

@@ -9,6 +9,8 @@ from chips.ssd1306 import SSD1306Chip
 _I2C = {
     "sim": (0, 5, 4, 6),
     "pico": (0, 5, 4, 6),
+    "gy87_pico": (0, 5, 4, 6),
+    "mpu9250_pico": (0, 5, 4, 6),
     "pico_w": (0, 5, 4, 6),
     "pico2": (0, 5, 4, 6),
     "pico2_w": (0, 5, 4, 6),
@@ -33,10 +35,32 @@ class Parts:
         self.buses = buses
 
 
+def _i2c_sensors(name, board, world, options):
+    """(IMU, the magnetometer behind it or None) of an I2C board."""
+    who, axes = options.get("who_am_i"), getattr(board, "MAG_AXES", ("x", "y", "z"))
+    if name == "mpu9250_pico":
+        from chips.ak8963 import AK8963Chip
+        from chips.mpu6500 import MPU6500Chip
+
+        return MPU6500Chip(world, who_am_i=who or 0x71), AK8963Chip(world, axes=axes)
+    imu = MPU6050Chip(world, who_am_i=who or 0x68)
+    if name != "gy87_pico":
+        return imu, None
+    if options.get("mag_chip") == "QMC5883L":
+        from chips.qmc5883l import QMC5883LChip
+
+        return imu, QMC5883LChip(world, axes=axes)
+    from chips.hmc5883l import HMC5883LChip
+
+    return imu, HMC5883LChip(world, axes=axes)
+
+
 def _i2c_board(name, board, world, options):
     """MPU6050 and SSD1306 on one bus, or the display on the next."""
     bus, scl, sda, interrupt = _I2C[name]
-    imu = MPU6050Chip(world, who_am_i=options.get("who_am_i") or 0x68)
+    imu, mag = _i2c_sensors(name, board, world, options)
+    if mag is not None and options.get("mag", True):
+        imu.aux.append(mag)
     display = SSD1306Chip(sh1106=options.get("sh1106", False))
     if options.get("imu", True):
         machine.wire_i2c(bus, imu, scl, sda)
@@ -48,7 +72,7 @@ def _i2c_board(name, board, world, options):
             machine.wire_i2c(bus, display, scl, sda)
         else:
             machine.wire_i2c(bus + 1, display)
-    return Parts(imu, None, display, [machine.I2C(bus)._bus, machine.I2C(bus + 1)._bus])
+    return Parts(imu, mag, display, [machine.I2C(bus)._bus, machine.I2C(bus + 1)._bus])
 
 
 def _robomaster_a(name, board, world, options):
@@ -79,7 +103,7 @@ def wire(name, board, world, options):
 
     board: its board.py, already imported, or None. options: who_am_i (None: the part that belongs there), and imu, mag,
     display: False where the part is missing; interrupt: False where INT is not wired; sh1106: True, the display's
-    controller.
+    controller; mag_chip: "QMC5883L" in place of a GY-87's HMC5883L.
     """
     if name not in BOARDS:
         raise ValueError(

@@ -26,6 +26,7 @@ CONFIG = {
     "mag": True,
     "display": True,
     "who_am_i": None,  # another identity for the IMU
+    "mag_chip": None,  # another magnetometer, see boards.py
     "dmp_image": None,  # a file that the IMU's DMP runs when it is loaded
     "irq_cost_us": 0,  # what the tick's code takes, beside its bus time
     "twin": None,  # "main_writes_shared_bus": what the firmware must not do, to show that it would be noticed

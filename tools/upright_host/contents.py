@@ -18,6 +18,8 @@ ARCHITECTURES = {
     "esp32": "xtensawin",
     "esp32_c3": "rv32imc",
     "esp32_s3": "xtensawin",
+    "gy87_pico": "armv6m",
+    "mpu9250_pico": "armv6m",
     "pico": "armv6m",
     "pico2": "armv7emsp",
     "pico2_w": "armv7emsp",
