@@ -613,7 +613,7 @@ def test_a_wrong_setting_or_part_is_a_valueerror_that_names_it(name, value):
     chip((0, 0, G))
     more = {"drive": "data_ready"} if name == "data_ready" else {}
     imu = upright.AHRS(MPU6050(bus()), **{"log": None, name: value} | more)
-    named = {"timer": "timer is|make_tick", "magnetometer": "magnetometer"}
+    named = {"timer": "timer is|make_tick", "magnetometer": "(?i)magnetometer"}
     with pytest.raises(ValueError, match=named.get(name, f"(?i){name} is|unknown filter")):
         imu.start()
     assert ahrs.running == []

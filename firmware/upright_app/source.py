@@ -23,7 +23,7 @@ class Source:
         if hasattr(board, "magnetometer"):
             try:
                 self.mag = board.magnetometer(imu)
-                self.mag.configure(rate_hz=settings.MAG_RATE_HZ)
+                self.mag.configure(settings.MAG_RATE_HZ, sample_rate=imu.sample_rate)
             except OSError as why:
                 self.mag = None
                 self.mag_fault = str(why)

@@ -369,7 +369,9 @@ class AHRS:
         self.magnetometer = mag
         self._own_mag = mag if mag.own_bus else None
         rate = settings.RATE if settings.EXTERNAL_CLOCK else sensor.sample_rate
-        if self._own_mag is None and self.drive == "timer" and rate != settings.RATE:
+        if self._own_mag is not None:  # it is read by each step, with the FIFO by each tick
+            rate = (settings.FIFO_HZ, 1) if self.drive == "fifo" else self.rate
+        elif self.drive == "timer" and rate != settings.RATE:
             raise ValueError(
                 "each magnetometer sample comes with one of the IMU's, so all of these must be read: "
                 "set SENSOR_RATE_HZ to RATE"
