@@ -18,11 +18,12 @@ class Hostile:
     it, per byte, fault).
 
     fault: None; ("nack", n) refuses the n-th acknowledge; ("cut", n) fails after n bytes read;
-    ("brown", n) lets the supply dip before byte n of a read.
+    ("brown", n) lets the supply dip before byte n of a read. swallows: as on rp2, see machine.py.
     """
 
-    def __init__(self, chip, now, plan):
+    def __init__(self, chip, now, plan, swallows=False):
         self.chip, self.now, self.plan = chip, now, list(plan)
+        self.swallows = swallows
 
     def _begin(self):
         delay, per_byte, fault = self.plan.pop() if self.plan else (500, 25, None)
@@ -42,7 +43,11 @@ class Hostile:
     def readfrom_mem_into(self, address, register, buffer):
         kind, n = self._begin()
         self._sent(self.chip.i2c_start(False, self.now))
-        self._sent(self.chip.i2c_write(register, self.now))
+        taken = self.chip.i2c_write(register, self.now)
+        if not taken and self.swallows:
+            self.chip.i2c_stop(self.now)
+            return
+        self._sent(taken)
         self._sent(self.chip.i2c_start(True, self.now))
         for i in range(len(buffer)):
             if kind == "cut" and i == n:
@@ -58,5 +63,8 @@ class Hostile:
         self._begin()
         self._sent(self.chip.i2c_start(False, self.now))
         for byte in buffer:
-            self._sent(self.chip.i2c_write(byte, self.now))
+            taken = self.chip.i2c_write(byte, self.now)
+            if not taken and self.swallows:
+                break
+            self._sent(taken)
         self.chip.i2c_stop(self.now)

@@ -747,3 +747,23 @@ def test_readings_for_interrupts_say_so_before_the_start(name):
     imu = upright.AHRS(MPU6050(machine.I2C(0, scl=machine.Pin(5), sda=machine.Pin(4)), 0x68))
     with pytest.raises(RuntimeError, match=r"start\(\) comes first"):
         getattr(imu, name)(array("i", [0] * 15))
+
+
+# ------------------------------------------------------------------------------- faults of the bus
+
+
+@pytest.mark.parametrize("drive", ["timer", "fifo"])
+def test_a_bus_that_is_stuck_for_a_while_costs_no_turn(drive):
+    world = chip((0, 0, G, 0, 0, round(50 * 16.4)))
+    i2c = machine.I2C(0, scl=machine.Pin(5), sda=machine.Pin(4), freq=400000, timeout=1500)
+    imu = upright.AHRS(MPU6050(i2c), drive=drive, measure_bias=False, log=None).start()
+    run(1)
+    before = imu.turns()
+    began = kernel.now()
+    i2c._bus.stuck = True
+    run(0.6)
+    i2c._bus.stuck = False
+    run(1.4)
+    turned = 360 * (imu.turns() - before)
+    assert abs(turned - 50 * (kernel.now() - began) / 1e6) < 2
+    assert imu.status()["errors"] > 0 and world

@@ -90,9 +90,7 @@ def test_without_an_address_nobody_and_a_stranger_are_told():
     with pytest.raises(MPU6050Error, match=r"no MPU6050 at 0x68 or 0x69.*pull-ups"):
         driver(address=None).configure()
     machine.wire_i2c(0, Clock(0x69))
-    with pytest.raises(
-        MPU6050Error, match=r"0x69 answers WHO_AM_I .* 0x17.*DS3231.*accept_unknown"
-    ):
+    with pytest.raises(MPU6050Error, match=r"WHO_AM_I .* 0x17 at 0x69.*DS3231.*accept_unknown"):
         driver(address=None).configure()
     assert kernel.now() < 1_000_000
 

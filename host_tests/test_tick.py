@@ -21,6 +21,7 @@ class Imu:
         self.reads = 0
         self.healths = 0
         self.packets = []
+        self.fifo_lost = 0
         self.fail = None
 
     def read(self):
@@ -260,6 +261,24 @@ def test_with_the_fifo_each_packet_is_a_step_however_late(imu, filter):
     tick.on_fifo(None)
     assert filter.words == [10, 11, 12]
     assert (tick.steps, tick.missed) == (3, 0)
+
+
+def test_packets_that_the_fifo_lost_are_coasted_through_a_bounded_number_a_tick(imu, filter):
+    tick = Tick(imu, filter, 0)
+    imu.packets = [1, 2]
+    tick.on_fifo(None)
+    imu.fifo_lost = 20
+    tick.on_fifo(None)
+    assert filter.flags == [1, 1] + [0] * 16
+    imu.packets = [3]
+    tick.on_fifo(None)
+    assert filter.flags[18:] == [0] * 4 + [1] and filter.words[-1] == 3
+    assert (tick.steps, tick.fresh) == (3, 3)
+    # set-up drops packets, too; that is nothing to make up for
+    imu.fifo_lost = 50
+    tick.resume()
+    tick.on_fifo(None)
+    assert len(filter.flags) == 23
 
 
 def test_an_empty_fifo_is_a_reason_to_look_at_the_chip(imu, filter):

@@ -35,6 +35,8 @@ class Ticks:
             # what reload() ends with: the loading itself is not for a tick
             dmp.needs_reload = False
             dmp._off = 0
+            dmp._imu.table.change_last(0xC0, 0xC0)  # USER_CTRL: DMP_EN, FIFO_EN
+            bus.memory[0x6A] |= 0xC0
 
     # Twins that must be found out
 

@@ -49,8 +49,9 @@ class Bus(Watched):
     def _answer(self, register, buffer):
         n = len(buffer)
         if register == 0x72:
-            buffer[0] = self.level >> 8
-            buffer[1] = self.level & 0xFF
+            level = self.level if self.memory[0x6A] & 0x40 else 0
+            buffer[0] = level >> 8
+            buffer[1] = level & 0xFF
         elif register == 0x74:
             self.fill()
             p = self.packet

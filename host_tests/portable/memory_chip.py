@@ -36,8 +36,9 @@ class Chip(Watched):
 
     def answer(self, register, buffer):
         if register == 0x72:
-            buffer[0] = self.level >> 8
-            buffer[1] = self.level & 0xFF
+            level = self.level if self.memory[0x6A] & 0x40 else 0  # USER_CTRL.FIFO_EN
+            buffer[0] = level >> 8
+            buffer[1] = level & 0xFF
         elif register == 0x74 or len(buffer) > 2:
             buffer[0] = self.status
             buffer[1] = self.word = (self.word + 37) & 0xFF

@@ -37,7 +37,7 @@ class Bus:
     def readfrom_mem_into(self, address, register, buffer):
         if register == 0x72:
             buffer[0] = 0
-            buffer[1] = 42
+            buffer[1] = 42 if self.memory[0x6A] & 0x40 else 0
         elif register == 0x3A or register == 0x74:
             self.word = (self.word + 37) & 0xFF
             for i in range(len(buffer)):

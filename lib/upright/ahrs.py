@@ -347,6 +347,8 @@ class AHRS:
             "sensor: %s, %d/%d Hz, +-%d g, +-%d deg/s"
             % ((sensor.chip,) + sensor.sample_rate + (sensor.accel_range_g, sensor.gyro_range_dps))
         )
+        for remark in getattr(sensor, "remarks", ()):
+            self.log("sensor:", remark)
 
     def _open_magnetometer(self):
         """Configure the magnetometer. Until it answers, the attitude comes from six axes."""

@@ -26,7 +26,7 @@ _FIFO_EN = const(0x40)
 _DMP_RESET = const(0x08)
 _READY_AND_OVERFLOW = const(0x11)  # INT_ENABLE: DATA_RDY, FIFO_OFLOW
 
-_HEAD = const(2)  # bytes of the FIFO's buffer before the first packet
+_HEAD = const(6)  # bytes of the FIFO's buffer before the first packet: HEAD of mpu_fifo.py
 _BASE_HZ = const(200)  # the images are made for this sample rate
 _ORDERLY = const(4)  # packets that the start-up check wants to see
 _COUNT_MASK = const(0x3FFFFFFF)
@@ -387,7 +387,7 @@ class MpuDmp(Attitude, Counters):
             fifo.restart()
             self._seen_ms = time.ticks_ms()
             return monitor.not_fresh()
-        level = fifo.bytes_waiting()
+        level = max(fifo.bytes_waiting(), 0)
         n = level // self._packet
         fifo.level = n
         if not n:

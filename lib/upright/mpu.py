@@ -10,7 +10,17 @@ import micropython
 from micropython import const
 
 from upright import mpu_parts
-from upright.mpu_fifo import Counters, Fifo, unpack
+from upright.mpu_fifo import (
+    ENABLED,
+    SAME,
+    SAME_SEEN,
+    SAME_TAKEN,
+    STATUS,
+    Counters,
+    Fifo,
+    make_buffer,
+    unpack,
+)
 from upright.mpu_monitor import Monitor
 from upright.mpu_table import RegisterTable
 
@@ -42,7 +52,7 @@ _CLK_PLL = const(0x01)  # CLKSEL 1, PLL on the X gyro: RM 4.28 prefers it to the
 _MASTER_MS = const(5)  # the master needs it for 24 bytes and five addresses at the slowest clock
 _EXT_BYTES = const(24)  # EXT_SENS_DATA
 _PACKET = const(14)  # accel x y z, temperature, gyro x y z
-_HEAD = const(2)  # bytes before a packet, see unpack()
+_HEAD = const(6)  # bytes before the first packet: HEAD of mpu_fifo.py
 
 # Until the zero-rate output has settled: PS 6.1; PS-MPU-6500A rev 1.3, table 1
 _GYRO_START_MS = const(30)
@@ -78,9 +88,10 @@ class Mpu(Counters):
     manager (`with`) the driver puts the chip to sleep at the end; entering configures nothing.
 
     Counters, wrapping at 2**30: errors (faults of the bus; on SPI, reads of a floating bus), stale (read() found
-    nothing new), resets (of the chip by itself), full_resets (by health(), when no samples came), fifo_overflows,
-    fifo_resets, fifo_lost (packets, as far as they could be counted). fifo_level is the number of packets that the
-    last poll left in the chip. chip is the part's name, who_am_i its identity.
+    nothing new), frozen (samples that were the same for too long), resets (of the chip by itself), full_resets (by
+    health(), when no samples came), fifo_overflows, fifo_resets, fifo_lost (packets, also those that came while nobody
+    could read). fifo_level is the number of packets that the last poll left in the chip. chip is the part's name,
+    who_am_i its identity, remarks a list of lines on how it differs from its data sheet.
 
     Set-up methods are not interrupt-safe: stop the tick first.
     """
@@ -99,6 +110,10 @@ class Mpu(Counters):
         self.table = RegisterTable(registers)
         self.monitor = Monitor(registers, self.table, counts)
         self.fifo = Fifo(registers, self.table, self.monitor, counts)
+        self.remarks = []  # how this chip differs from its data sheet, a line each; found by configure()
+        self._always = False
+        self._own_accel_filter = False
+        self._sampled_us = 0
         self._length_behind(0, 0)
         self._temperature = mpu_parts.T_6050
         self._begun = False
@@ -128,27 +143,41 @@ class Mpu(Counters):
             return self._withheld()
         raw = self._raw
         try:
-            self._read_into(_INT_STATUS, self._burst)
+            self._read_into(self._first, self._burst)
         except OSError:
             return self.monitor.fault()
         counts = self.counts
         flags = unpack(raw, _HEAD, counts)
         if not flags:
-            if not self._is_sample(raw):
+            flags = self._unusual(raw)
+            if not flags:
                 return counts[_FLAGS]
-            flags = unpack(raw, _HEAD, counts)
         device = self.aux_device
         if device is not None:
             flags |= device.take(raw, _HEAD + _PACKET, counts)
             counts[_FLAGS] = flags
         return flags
 
+    def _unusual(self, raw):
+        """What is not an ordinary sample: flags if it is one all the same, else 0."""
+        if raw[SAME] != SAME_SEEN:
+            if not self._is_sample(raw):
+                return 0
+            flags = unpack(raw, _HEAD, self.counts)
+            if flags:
+                return flags
+        raw[STATUS] = 0xFF
+        if not self.monitor.same(raw):
+            return 0
+        raw[STATUS] = _DATA_RDY
+        return unpack(raw, _HEAD, self.counts)
+
     def _withheld(self):
         """read() while the chip is repaired or the gyro settles."""
         if self.monitor.state == _RESET:
             return self.monitor.not_fresh()  # the chip must not be accessed
         try:
-            self._read_into(_INT_STATUS, self._burst)
+            self._read_into(self._first, self._burst)
         except OSError:
             return self.monitor.fault()
         if self._is_sample(self._raw):
@@ -157,19 +186,31 @@ class Mpu(Counters):
 
     def _is_sample(self, raw):
         """Is there a new sample? Handles every other value of INT_STATUS."""
-        status = raw[1]
-        raw[1] = 0xFF
+        status = raw[STATUS]
+        raw[STATUS] = 0xFF
         if status & _NO_STATUS:  # a floating bus, or a transfer that did not fill the buffer
             self.monitor.fault()
             return False
         if status & _FIFO_OFLOW:
             self.monitor.fifo_misaligned = 1  # reading the flag has cleared it
-        if status & _DATA_RDY:
-            raw[1] = _DATA_RDY  # the rest is handled
+        if self._by_time:
+            status |= self._is_due(raw)
+        if status & _DATA_RDY and raw[ENABLED] & _DATA_RDY:
+            raw[STATUS] = _DATA_RDY  # the rest is handled
             return True
         self.stale = (self.stale + 1) & _COUNT_MASK
         self.monitor.no_sample(raw)
         return False
+
+    def _is_due(self, raw):
+        """Going by time: _DATA_RDY once a sample is due, else 0."""
+        now = time.ticks_us()
+        if 0 <= time.ticks_diff(now, self._sampled_us) < self.fifo.period_us >> 1:
+            return 0
+        if not self._has_words(raw):
+            return 0
+        self._sampled_us = now
+        return _DATA_RDY
 
     def temperature_cdeg(self, counts=None):
         """Temperature in hundredths of a degC, by the formula of the part; counts: None: of the newest sample."""
@@ -254,7 +295,9 @@ class Mpu(Counters):
         rate = mpu_parts.ratio(sample_rate_hz)
         if not self._begun:
             self.begin()
-        filters = mpu_parts.Filters(self.chip, self.family_6500, dlpf, accel_dlpf, rate)
+        filters = mpu_parts.Filters(
+            self.chip, self.family_6500, self._own_accel_filter, dlpf, accel_dlpf, rate
+        )
 
         self.fifo.stop()
         self.monitor.fifo_misaligned = 0
@@ -268,7 +311,7 @@ class Mpu(Counters):
             (_GYRO_CONFIG, fs << 3 | filters.fchoice_b),
             (_ACCEL_CONFIG, afs << 3),
         ]
-        if self.family_6500:
+        if filters.accel_config2 is not None:
             rows.append((_ACCEL_CONFIG2, filters.accel_config2))
         rows += [
             # never INT_RD_CLEAR: any read would then clear the FIFO overflow flag (RM 4.14)
@@ -302,9 +345,11 @@ class Mpu(Counters):
             1 + self.settle_ms * num // (1000 * den),
             1000 * den // num,
         )
+        self.fifo.period_us = (2_000_000 * den + num) // (2 * num)
         self._configured = True
+        self._trust(True)
         if settle:
-            self._settle()
+            self._learn_habits(1 + 1000 * den // num)
 
     def begin(self):
         """Find the chip, check its identity, reset it (0.1 s). Raises the driver's own error."""
@@ -317,6 +362,7 @@ class Mpu(Counters):
         if port.after_reset:
             time.sleep_ms(100)
         self._adopt(port.find())
+        self._probe_part()
         self._begun = True
 
     def configure_interrupt(self, active_low=False, open_drain=False, latch=False):
@@ -481,8 +527,8 @@ class Mpu(Counters):
         """Make buffers for samples with so many bytes behind them."""
         self.fifo.packet = _PACKET + length
         self._fifo_bits = _FIFO_ALL | (fifo_en & 0x07 if length else 0)
-        self._raw = bytearray(_HEAD + _PACKET + length)  # see unpack(); raw[1] is INT_STATUS
-        self._burst = memoryview(self._raw)[_HEAD - 1 :]
+        self._raw = make_buffer(_PACKET + length)
+        self._trust(not self._always)
 
     def _measure_packet(self):
         """Raise error_class unless a sample brings as many bytes as attach() was told."""
@@ -545,13 +591,94 @@ class Mpu(Counters):
             time.sleep_ms(_MASTER_MS)
         self.write_register(_USER_CTRL, self.port.interface)
 
+    def _probe_part(self):
+        """Find out what the identity does not tell, after a reset."""
+        if self._temperature is None:
+            asleep = self.read_register(_PWR_MGMT_1) & _SLEEP
+            self.family_6500, self._temperature = mpu_parts.of_unknown(self.family_6500, asleep)
+        self._own_accel_filter = self.family_6500
+        if self.family_6500:
+            self.write_register(_PWR_MGMT_1, _CLK_PLL)
+            self.write_register(_ACCEL_CONFIG2, 0x05)
+            if self.read_register(_ACCEL_CONFIG2) & 0x0F != 0x05:
+                self._own_accel_filter = False
+                self.remarks.append("it has no ACCEL_CONFIG2: dlpf sets both filters")
+
+    def _learn_habits(self, period_ms):
+        """Wait as _settle() does, and find out meanwhile how the chip says that it has sampled."""
+        registers = self.registers
+        # Without its bit in INT_ENABLE no part of the family may set DATA_RDY (RM 4.15, 4.16); some do.
+        registers.write_register(_INT_ENABLE, 0)
+        raw = self._raw
+        registers.read_registers(_INT_STATUS, self._burst)
+        time.sleep_ms(max(self.settle_ms - 1, period_ms + 1))
+        registers.read_registers(_INT_STATUS, self._burst)
+        always = raw[STATUS] & _DATA_RDY
+        registers.write_register(_INT_ENABLE, _DATA_RDY)
+        if always:
+            self._trust(False)
+            self._tell("it sets DATA_RDY without INT_ENABLE: each sample is read with INT_ENABLE")
+        begun = time.ticks_ms()
+        while True:
+            registers.read_registers(self._first, self._burst)
+            if raw[STATUS] & _DATA_RDY:
+                break
+            if time.ticks_diff(time.ticks_ms(), begun) > 2 * period_ms + 5:
+                # after its reset only a chip that samples has anything here
+                self._by_time = self._has_words(raw)
+                break
+            time.sleep_us(200)
+        if self._by_time:
+            self._tell("it never sets DATA_RDY (a simulator, or a clone): going by time")
+            raw[STATUS] = _DATA_RDY
+            self.monitor.constant = not self._varies(period_ms)
+            if self.monitor.constant:
+                self._tell("its samples never vary, as a simulator's")
+        raw[SAME] = SAME_TAKEN
+        if unpack(raw, _HEAD, self.counts):
+            self.monitor.not_fresh()
+        raw[SAME] = 0
+        self.monitor.heard()
+
+    def _varies(self, period_ms):
+        """Do the words change within eight samples, or a tenth of a second?"""
+        first = bytes(self._raw[_HEAD:])
+        for _ in range(min(8, 1 + 100 // period_ms)):
+            time.sleep_ms(period_ms)
+            self.registers.read_registers(self._first, self._burst)
+            if bytes(self._raw[_HEAD:]) != first:
+                self._raw[STATUS] = _DATA_RDY
+                return True
+        self._raw[STATUS] = _DATA_RDY
+        return False
+
+    def _trust(self, data_ready):
+        """Does DATA_RDY prove that INT_ENABLE is set, and so that the chip was not reset? Else bursts begin there."""
+        self._by_time = self.monitor.constant = False
+        self._always = not data_ready
+        self._first = _INT_STATUS if data_ready else _INT_ENABLE
+        self._burst = memoryview(self._raw)[STATUS if data_ready else ENABLED :]
+        self._raw[ENABLED] = _DATA_RDY
+        self.fifo.distrust(self._always)
+
+    def _tell(self, remark):
+        if remark not in self.remarks:
+            self.remarks.append(remark)
+
+    def _has_words(self, raw):
+        """Does the accelerometer measure anything? All zeros are no sample, but in free fall for a moment."""
+        at = _HEAD
+        return bool(raw[at] | raw[at + 1] | raw[at + 2] | raw[at + 3] | raw[at + 4] | raw[at + 5])
+
     def _settle(self):
         time.sleep_ms(self.settle_ms)
         # a sample that was ready meanwhile: accel() has it until there is a newer one
         raw = self._raw
-        self.registers.read_registers(_INT_STATUS, self._burst)
+        self.registers.read_registers(self._first, self._burst)
+        raw[SAME] = SAME_TAKEN
         if unpack(raw, _HEAD, self.counts):
             self.monitor.not_fresh()
+        raw[SAME] = 0
         self.monitor.heard()
 
     def _need_configured(self):

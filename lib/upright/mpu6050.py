@@ -18,6 +18,7 @@ from upright.registers import I2CRegisters
 
 _WHO_AM_I = const(0x75)
 _ADDRESSES = (0x68, 0x69)  # with AD0 low, high
+_TIMED_OUT = (110, 116)  # ETIMEDOUT: MicroPython's, and newlib's on esp32
 _CLOCK = "A DS1307 or DS3231 clock has the address 0x68, too"
 
 
@@ -40,6 +41,7 @@ class I2CPort:
         self._accept_unknown = accept_unknown
         self._name = name
         self._only_6500 = only_6500
+        self._timed_out = False
 
     @property
     def where(self):
@@ -69,19 +71,20 @@ class I2CPort:
         return answers[address], self._part(answers[address])
 
     def _is_wanted(self, who):
+        if mpu_parts.answers_nothing(who):
+            return False
         return who in mpu_parts.PARTS or self._accept_unknown
 
     def _part(self, who):
         where = f"0x{self.registers.address:02x}"
         part = mpu_parts.PARTS.get(who)
         if part is None:
-            if not self._accept_unknown:
+            if not self._is_wanted(who):
                 raise self._error_class(
-                    f"{where} answers WHO_AM_I (0x75) with 0x{who:02x}; known are {mpu_parts.known()}. "
-                    f"{_CLOCK}. accept_unknown=True uses it as an {self._name}"
+                    mpu_parts.stranger(who, self.where, f"an {self._name}", _CLOCK)
                 )
-            return mpu_parts.unknown(who, self._only_6500)
-        if self._only_6500 and not part[1]:
+            return mpu_parts.unknown(who, True if self._only_6500 else None)
+        if self._only_6500 and part[1] is False:
             raise self._error_class(
                 f"{where} is an {part[0]} (0x{who:02x}), not of the MPU6500 family: "
                 "use MPU6050, which drives both"
@@ -98,14 +101,21 @@ class I2CPort:
             try:
                 self.registers.read_into(_WHO_AM_I, byte)
                 answers[address] = byte[0]
-            except OSError:
-                pass
+            except OSError as why:
+                self._timed_out = why.args[0] in _TIMED_OUT
         self.registers.address = there
         return answers
 
     def _absent(self):
         tried = "(WHO_AM_I: no answer to 11 reads in 0.1 s)"
         check = "Check supply, SDA, SCL and their pull-ups"
+        if self._timed_out:
+            return (
+                "the I2C bus timed out (ETIMEDOUT), so it does not tell whether an "
+                f"{self._name} is there: SDA or SCL is held low or has no pull-up, or the bus has a timeout= shorter "
+                "than a transfer. Switch the sensor off and on, and check the wires; i2c_bus.free() frees a bus whose "
+                "chip was cut off in a read"
+            )
         if self.searches:
             return f"no {self._name} at 0x68 or 0x69; {check} {tried}"
         address = self.registers.address

@@ -66,18 +66,13 @@ class SPIPort:
                 "the bus is in mode 0 or 3"
             )
         part = mpu_parts.PARTS.get(who)
+        if who == 0x68:
+            return who, mpu_parts.MPU6000
         if part is None:
             if not self._accept_unknown:
-                raise MPU6500Error(
-                    f"WHO_AM_I (0x75) reads 0x{who:02x} on SPI; known are {mpu_parts.known()}. A bus in "
-                    "mode 1 or 2 or over 1 MHz garbles it too. accept_unknown=True uses it as an MPU6500"
-                )
+                garbled = "A bus in mode 1 or 2 or over 1 MHz garbles it too"
+                raise MPU6500Error(mpu_parts.stranger(who, self.where, "an MPU6500", garbled))
             part = mpu_parts.unknown(who, True)
-        elif not part[1]:
-            raise MPU6500Error(
-                f"WHO_AM_I (0x75) reads 0x{who:02x} on SPI: an {part[0]}, which has no SPI, or an "
-                "MPU6000, which this driver does not know"
-            )
         return who, part
 
 

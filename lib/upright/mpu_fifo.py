@@ -2,6 +2,8 @@
 # Needs mpu_monitor.py; registers and table are passed in. Runs on MicroPython >= 1.22 and under CPython with
 # a `micropython` shim. RM is RM-MPU-6000A rev 4.2.
 
+from time import ticks_diff, ticks_us
+
 import micropython
 from micropython import const
 
@@ -20,25 +22,47 @@ _I2C_IF_DIS = const(0x10)
 _FIFO_RESET = const(0x04)
 
 _PACKET = const(14)  # accel x y z, temperature, gyro x y z
-_HEAD = const(2)  # bytes in front of the first packet of a buffer, see unpack()
 _FLAGS = const(10)  # of counts
 _COUNT_MASK = const(0x3FFFFFFF)
+_MOST_LOST_US = const(2_000_000)  # an outage is counted in packets: what is older means nothing
+_SAME_PARTS = const(3)  # polls in a row that find the same part of a packet
+
+# The head of a buffer of samples: HEAD bytes, then the first packet. In order: not 0 since a poll found nothing new,
+# see mpu_monitor.py; the samples that differed from the one before, up to VARIED; whether the newest is the same
+# (SAME_...); and three registers: INT_ENABLE, one that is not used, INT_STATUS.
+HEAD = const(6)
+QUIET = const(0)
+CHANGES = const(1)
+SAME = const(2)
+ENABLED = const(3)
+STATUS = const(5)
+VARIED = const(64)
+SAME_SEEN = const(1)
+SAME_TAKEN = const(2)
+
+
+def make_buffer(length):
+    """A buffer for samples of `length` bytes in all."""
+    buffer = bytearray(HEAD + length)
+    buffer[ENABLED] = _DATA_RDY
+    buffer[STATUS] = 0xFF
+    return buffer
 
 
 @micropython.viper
 def unpack(buffer: ptr8, at: int, counts: ptr16) -> int:
     """Big-endian accel, temperature, gyro at buffer[at..at+13] into counts; returns the flags.
 
-    The first packet is at buffer[2], behind INT_STATUS. If that is not exactly DATA_RDY, this returns 0 and counts stay
-    unchanged. Afterwards it is set to 0xff, which is not a status: so a transfer that does not fill the buffer gives no
-    sample. buffer[0] is 1 after a poll that found no sample; it is cleared here.
+    0: the sample is not an ordinary one, and counts are as they were. Either INT_STATUS before the first packet is
+    not exactly DATA_RDY, or INT_ENABLE lacks it. Or all words are the same as before: then buffer[SAME] is SAME_SEEN,
+    and with SAME_TAKEN there the sample is taken all the same. Afterwards INT_STATUS is 0xff, which is not a status: so
+    a transfer that does not fill the buffer gives no sample.
     """
-    if at == 2:
-        if buffer[1] != 1:
+    if at == HEAD:
+        if buffer[STATUS] != 1 or buffer[ENABLED] & 1 == 0:
             return 0
-        buffer[1] = 0xFF
-    buffer[0] = 0
     flags = 1
+    changed = 0
     i = 0
     while i < 6:
         j = at + i + i
@@ -46,13 +70,44 @@ def unpack(buffer: ptr8, at: int, counts: ptr16) -> int:
             j += 2  # past the temperature
         # signed by arithmetic: viper stores the low 16 bits, CPython's array wants the number
         word = ((buffer[j] << 8 | buffer[j + 1]) ^ 0x8000) - 0x8000
+        changed |= (counts[i] ^ word) & 0xFFFF
         counts[i] = word
         if word == 0x7FFF or word == -0x8000:
             flags |= 4 if i < 3 else 8
         i += 1
-    counts[9] = ((buffer[at + 6] << 8 | buffer[at + 7]) ^ 0x8000) - 0x8000
+    word = ((buffer[at + 6] << 8 | buffer[at + 7]) ^ 0x8000) - 0x8000
+    changed |= (counts[9] ^ word) & 0xFFFF
+    counts[9] = word
+    if changed:
+        buffer[QUIET] = 0
+        if buffer[CHANGES] < VARIED:
+            buffer[CHANGES] += 1
+    elif buffer[SAME] != SAME_TAKEN:
+        buffer[SAME] = SAME_SEEN
+        return 0
+    buffer[SAME] = 0
+    buffer[STATUS] = 0xFF
     counts[10] = flags
     return flags
+
+
+@micropython.viper
+def _blank(buffer: ptr8):
+    """Write what no packet can be, -1 in every word, where the first one will be."""
+    i = HEAD
+    while i < HEAD + _PACKET:
+        buffer[i] = 0xFF
+        i += 1
+
+
+@micropython.viper
+def _is_blank(buffer: ptr8) -> int:
+    i = HEAD
+    while i < HEAD + _PACKET:
+        if buffer[i] != 0xFF:
+            return 0
+        i += 1
+    return 1
 
 
 class Fifo:
@@ -76,17 +131,25 @@ class Fifo:
         self.lost = 0
         self.batch = 0  # packets that one poll fetches at most
         self.device = None
-        self.buffer = bytearray(_HEAD)  # the packets of the batch, from 2 on
+        self.buffer = make_buffer(0)  # the packets of the batch, from HEAD on
         self._views = ()
         self._full = 0  # packets from which on the FIFO counts as full
         self._pending = 0  # packets of the batch not yet delivered
         self._at = 0  # where the next one begins
+        self._part = self._parts = 0  # of a packet that the last polls left, and how many of them
+        self.period_us = 0  # of the samples
+        # packets that were in the chip after the last poll that went well, and when; and the time of the present one
+        self._left = 0
+        self._counted_us = self._now_us = 0
         self._table = table
         self._monitor = monitor
         self._counts = counts
         self._byte = bytearray(1)
         self._pair = bytearray(2)
         self._status = bytearray(1)
+        self._proof = (
+            _DATA_RDY  # the bit of INT_STATUS that proves INT_ENABLE to be set, see distrust()
+        )
         self._read_into = registers.read_into
         self._write = registers.write
         self.next = self.next  # for a quick look-up, see mpu_monitor.Monitor
@@ -99,10 +162,10 @@ class Fifo:
         if not isinstance(batch, int) or not 1 <= batch <= self.size // size:
             raise ValueError(f"batch {batch!r} is not 1 to {self.size // size}")
         self._full = self.size // size - 1
-        if len(self.buffer) != _HEAD + batch * size or batch != self.batch:
-            self.buffer = bytearray(_HEAD + batch * size)
+        if len(self.buffer) != HEAD + batch * size or batch != self.batch:
+            self.buffer = make_buffer(batch * size)
             whole = memoryview(self.buffer)
-            self._views = [whole[_HEAD : _HEAD + n * size] for n in range(batch + 1)]
+            self._views = [whole[HEAD : HEAD + n * size] for n in range(batch + 1)]
             self.batch = batch
         self.stop()
 
@@ -113,8 +176,13 @@ class Fifo:
 
     def drop(self):
         """Drop the contents of the FIFO: it is restarted before the next packet."""
-        self._pending = 0
+        self._pending = self.level = self._left = 0
+        self._counted_us = ticks_us()  # set-up takes time that no filter has to make up for
         self._monitor.fifo_misaligned = 1
+
+    def distrust(self, data_ready_always):
+        """Whether the chip sets DATA_RDY without INT_ENABLE, too: then it proves nothing."""
+        self._proof = 0 if data_ready_always else _DATA_RDY
 
     # The tick: nothing below allocates, waits, raises or uses a float. The functions are small for the reason
     # given in mpu_monitor.py.
@@ -132,17 +200,29 @@ class Fifo:
             self.restart()
             return 0
         level = self.bytes_waiting()
+        if level < 0:
+            return 0
         packets = level // self.packet
         self.level = packets
+        self._now_us = ticks_us()
         if not packets:
+            self._left = 0
+            self._counted_us = self._now_us
             self._monitor.no_sample(self.buffer)
             return 0
         # The last packet is complete. So if a part of a packet is left, either the chip is writing one, or the
         # first one has lost its beginning: wait, if necessary until the FIFO is full, and drop all.
         level -= packets * self.packet
-        if level and packets < self._full:
+        if level and packets < self._full and not self._stands(level):
             return 0
         return self.drain(packets if packets < self.batch else self.batch, level)
+
+    def _stands(self, level):
+        """Was the FIFO as full as this, with a part of a packet, at the last polls? Then it is smaller than believed."""
+        level += self.level * self.packet
+        self._parts = self._parts + 1 if level == self._part else 0
+        self._part = level
+        return self._parts >= _SAME_PARTS
 
     @micropython.native
     def next(self):
@@ -157,26 +237,38 @@ class Fifo:
             return self._monitor.withhold()
         counts = self._counts
         flags = unpack(self.buffer, at, counts)
+        if not flags:
+            flags = self._again(at)
+            if not flags:
+                return counts[_FLAGS]
         device = self.device
         if device is not None:
             flags |= device.take(self.buffer, at + _PACKET, counts)
             counts[_FLAGS] = flags
         return flags
 
+    def _again(self, at):
+        """The packet is the same as the one before."""
+        if self._monitor.same(self.buffer):
+            return unpack(self.buffer, at, self._counts)
+        return 0
+
+    @micropython.native
     def bytes_waiting(self):
-        """FIFO_COUNT; 0 also when the bus fails."""
+        """FIFO_COUNT; -1 when the bus fails."""
+        self._pair[0] = 0xFF  # more than any FIFO holds, should the transfer not fill it
         try:
             # high byte first: it latches the low (RM 4.30)
             self._read_into(_FIFO_COUNTH, self._pair)
         except OSError:
             self._monitor.fault()
-            return 0
+            return -1
         level = self._pair[0] << 8 | self._pair[1]
         if level <= self.size:
             return level
         self._monitor.fifo_misaligned = 1  # a chip that fails here leaves the bus high: 0xffff
         self._monitor.fault()
-        return 0
+        return -1
 
     def drain(self, n, fraction):
         """Read n packets, or none if they may be incomplete."""
@@ -185,14 +277,14 @@ class Fifo:
         if self._fetch(n) and not fraction:
             self._monitor.fifo_misaligned = 0
             self.level -= n
-            self._at = _HEAD
-            self.buffer[1] = _DATA_RDY  # for unpack()
+            self._left = self.level
+            self._counted_us = self._now_us
+            self._at = HEAD
+            self.buffer[STATUS] = _DATA_RDY  # for unpack()
             self._pending = n
             return n
         if self._status[0] & _FIFO_OFLOW:
             self.overflows = (self.overflows + 1) & _COUNT_MASK
-        self.lose(self.level)
-        self.level = 0
         self.restart()
         return 0
 
@@ -204,13 +296,17 @@ class Fifo:
         """Count lost packets."""
         self.lost = (self.lost + n) & _COUNT_MASK
 
+    @micropython.native
     def _fetch(self, n):
         """Read n packets in one burst; 1 if nothing has shifted or replaced them by its end."""
+        # A transfer may leave its buffer as it was and raise nothing, see mpu_monitor.py
         self._status[0] = 0
+        _blank(self.buffer)
         try:
             self._read_into(_FIFO_R_W, self._views[n])
+            self._status[0] = 0xFF
             self._read_into(_INT_STATUS, self._status)
-            if self._status[0] & _NO_STATUS:
+            if self._status[0] & _NO_STATUS or _is_blank(self.buffer):
                 self._status[0] = 0
                 self._monitor.fault()
                 return 0
@@ -218,10 +314,12 @@ class Fifo:
                 return 0
             # DATA_RDY since the last read proves that INT_ENABLE is still set, so there was no reset.
             # Without it, check: a FIFO that a reset has emptied repeats its last byte.
-            if self._status[0] & _DATA_RDY:
+            if self._status[0] & self._proof:
                 return 1
+            self._byte[0] = 0xFF
             self._read_into(_USER_CTRL, self._byte)
         except OSError:
+            self._status[0] &= _FIFO_OFLOW
             self._monitor.fault()
             return 0
         # the whole register: a chip that fails now leaves the bus high, 0xff
@@ -237,13 +335,29 @@ class Fifo:
             self._write(_USER_CTRL, user_ctrl)
             self._write(_USER_CTRL, user_ctrl | _FIFO_RESET)
             self._read_into(_INT_STATUS, self._byte)  # an overflow of the past
+            # a port may swallow that the chip has refused the write: see mpu_monitor.py
+            if self.bytes_waiting() != 0:
+                return False
             self._write(_USER_CTRL, user_ctrl | _FIFO_ENABLE)
         except OSError:
             self._monitor.fault()
             return False
         self._monitor.fifo_misaligned = 0
         self.resets = (self.resets + 1) & _COUNT_MASK
+        self._lose_all()
         return True
+
+    def _lose_all(self):
+        """Count what was in the FIFO at the last look, and what the chip has sampled since."""
+        now = ticks_us()
+        if self.on:
+            passed = ticks_diff(now, self._counted_us)
+            if not 0 <= passed <= _MOST_LOST_US:
+                passed = _MOST_LOST_US
+            self.level = self._left + (passed + (self.period_us >> 1)) // self.period_us
+        self.lose(self.level)
+        self.level = self._left = 0
+        self._counted_us = now
 
 
 class Counters:
@@ -252,6 +366,10 @@ class Counters:
     @property
     def errors(self):
         return self.monitor.errors
+
+    @property
+    def frozen(self):
+        return self.monitor.frozen
 
     @property
     def resets(self):

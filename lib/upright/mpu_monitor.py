@@ -40,6 +40,15 @@ _MASTER_MS = const(5)
 _DOUBT = const(1)  # a reset would explain the fault: compare PWR_MGMT_1 out of turn
 _LOOKED = const(2)  # the last call did
 
+# The head of a buffer, see mpu_fifo.py, and values of its first byte
+_QUIET = const(0)
+_CHANGES = const(1)
+_SAME = const(2)
+_VARIED = const(64)
+_SAME_TAKEN = const(2)
+_NOTHING_NEW = const(1)
+_FROZEN = const(2)
+
 _FLAGS = const(10)  # of counts
 _FULL_SCALE_FLAGS = const(0x0C)
 _COUNT_MASK = const(0x3FFFFFFF)  # counters wrap within a small int of 32-bit ports
@@ -54,11 +63,17 @@ class Monitor:
     are correct but no samples come, or if three repairs in a row fail, the chip gets a full RESET first. The first row
     of the table is PWR_MGMT_1, the last USER_CTRL.
 
-    errors, resets (of the chip by itself) and full_resets (by this) are counters.
+    errors, frozen (samples that were the same for too long), resets (of the chip by itself) and full_resets (by this)
+    are counters.
+
+    A transfer may leave its buffer as it was and raise nothing: the rp2 port does so when the chip refuses the number
+    of the register (machine_i2c.c: a short write in readfrom_mem_into is no error there). So a buffer first gets what
+    the register cannot hold, or should not.
     """
 
     def __init__(self, registers, table, counts):
         self.errors = 0
+        self.frozen = 0
         self.resets = 0
         self.full_resets = 0
         self.fifo_misaligned = (
@@ -66,6 +81,8 @@ class Monitor:
         )
         self.device = None  # what is attached behind the chip; its health() has every second turn
         self.who_am_i = None
+        # True: the samples of this chip do not vary, as those of a simulator: that they stay the same says nothing
+        self.constant = False
         self._read_into = registers.read_into
         self._write = registers.write
         self._table = table
@@ -174,18 +191,36 @@ class Monitor:
         """Does a register still have the value of the table?"""
         table = self._table
         byte = self._byte
+        byte[0] = table.values[row] ^ 0xFF
         try:
             self._read_into(table.numbers[row], byte)
             if not (byte[0] ^ table.values[row]) & table.masks[row]:
                 return HEALTH_OK
-            # does the chip answer, or is the bus floating?
-            self._read_into(_WHO_AM_I, byte)
-            if byte[0] == self.who_am_i:
-                return HEALTH_MISMATCH
+        except OSError:
+            self.fault()
+            return HEALTH_BUS_ERROR
+        return self._differs(row)
+
+    @micropython.native
+    def _differs(self, row):
+        """The register has another value: has the chip been reset, or did the bus fail?"""
+        byte = self._byte
+        byte[0] = self._table.values[row]  # the second time the other way round
+        try:
+            self._read_into(self._table.numbers[row], byte)
+            if self._wrong(row):
+                # does the chip answer, or is the bus floating?
+                byte[0] = ~self.who_am_i & 0xFF
+                self._read_into(_WHO_AM_I, byte)
+                if byte[0] == self.who_am_i:
+                    return HEALTH_MISMATCH
         except OSError:
             pass
         self.fault()
         return HEALTH_BUS_ERROR
+
+    def _wrong(self, row):
+        return (self._byte[0] ^ self._table.values[row]) & self._table.masks[row]
 
     def _repair(self):
         """The chip has reset itself."""
@@ -207,6 +242,7 @@ class Monitor:
                 self._write(self._table.numbers[row], self._table.values[row])
             else:
                 # a master that still runs may be in a transaction
+                self._byte[0] = self._table.last()
                 self._read_into(_USER_CTRL, self._byte)
                 self._write(_USER_CTRL, self._interface | self._byte[0] & _I2C_MST_EN)
         except OSError:
@@ -270,15 +306,41 @@ class Monitor:
         self._doubt |= _DOUBT
 
     def no_sample(self, quiet):
-        """There is no new sample. quiet[0] is 0 where the last poll had one; returns the flags as fault() does."""
+        """There is no new sample. quiet: the head of a buffer, see mpu_fifo.py; returns the flags as fault() does."""
         self._doubt |= _DOUBT
-        if not quiet[0]:
-            quiet[0] = 1
+        if not quiet[_QUIET]:
+            quiet[_QUIET] = _NOTHING_NEW
             self.heard()
         elif time.ticks_diff(time.ticks_ms(), self._since) > self._patience_ms:
             # has sleep() put it to sleep?
             self._silent = 0 if self._table.values[0] & _SLEEP else 1
         return self.not_fresh()
+
+    def same(self, quiet):
+        """A new sample with the same words as the last one: may it be used? quiet: the head of its buffer.
+
+        Two such samples are a rare chance. A chip that hangs gives them for ever, and is reset. A simulator may, too:
+        what has never varied is not expected to.
+        """
+        if self.constant or quiet[_CHANGES] < _VARIED:
+            quiet[_QUIET] = 0
+        elif not quiet[_QUIET]:
+            quiet[_QUIET] = _NOTHING_NEW
+            self.heard()
+        elif (
+            quiet[_QUIET] == _FROZEN
+            or time.ticks_diff(time.ticks_ms(), self._since) > self._patience_ms
+        ):
+            if time.ticks_diff(time.ticks_ms(), self._since) > self._patience_ms:
+                self._silent = 1
+            quiet[_QUIET] = _FROZEN
+            quiet[_SAME] = 0
+            self._doubt |= _DOUBT
+            self.frozen = (self.frozen + 1) & _COUNT_MASK
+            self.not_fresh()
+            return False
+        quiet[_SAME] = _SAME_TAKEN
+        return True
 
     def heard(self):
         """Restart the time limit for the next sample."""

@@ -13,12 +13,21 @@ PARTS = {
     0x68: ("MPU6050", False, 1024, T_6050),
     0x70: ("MPU6500", True, 512, _T_6500),
     0x71: ("MPU9250", True, 512, _T_6500),
+    # a common clone of the MPU6050; None: what it is like shows after its reset, see of_unknown()
+    0x72: ("MPU6050 clone (0x72)", None, 512, None),
     0x73: ("MPU9255", True, 512, _T_6500),
     0x74: ("MPU6515", True, 512, _T_6500),
     0x75: ("MPU6500 clone (0x75)", True, 512, _T_6500),
     0x78: ("MPU6880", True, 512, _T_6500),
     0x98: ("ICM-20689", True, 512, _T_20689),
 }
+
+MPU6000 = ("MPU6000", False, 1024, T_6050)  # an MPU6050 on SPI
+
+# Parts that have nearly the registers of an MPU6500, but another FIFO and no auxiliary bus (MPU6886 and ICM-20602
+# datasheets, register maps: FIFO_EN has other bits)
+_ALIKE = {0x12: "ICM-20602", 0x19: "MPU6886"}
+_OTHERS = {0x47: "ICM-42688-P"}
 
 ACCEL_RANGES = (2, 4, 8, 16)  # g; RM 4.5, LSB per g RM 4.17
 GYRO_RANGES = (250, 500, 1000, 2000)  # deg/s; RM 4.4
@@ -90,9 +99,42 @@ def known():
     return ", ".join(f"0x{who:02x}" for who in sorted(PARTS))
 
 
-def unknown(who, family_6500):
+def answers_nothing(who):
+    """Whether a WHO_AM_I is what a bus reads that nobody drives, or that is held low."""
+    return who in (0x00, 0xFF)
+
+
+def unknown(who, family_6500=None):
     """A row for a part that is not in the table: taken for the smallest of the family."""
-    return f"unknown (0x{who:02x})", family_6500, 512, _T_6500 if family_6500 else T_6050
+    return _ALIKE.get(who) or f"unknown (0x{who:02x})", family_6500, 512, None
+
+
+def of_unknown(family_6500, asleep):
+    """(of the MPU6500 family, temperature) of a part whose row leaves them open. Asleep after its reset, it is like an
+    MPU6050 (RM 4.28; RM-6500 4.33: awake)."""
+    if family_6500 is None:
+        family_6500 = not asleep
+    return family_6500, _T_6500 if family_6500 else T_6050
+
+
+def stranger(who, where, what, hint):
+    """What to tell of a part that is not in the table. where: "at 0x68"; what: "an MPU6050", of the driver; hint: of
+    the bus."""
+    reads = f"WHO_AM_I (0x75) reads 0x{who:02x} {where}"
+    if answers_nothing(who):
+        return (
+            f"{reads}, which no part has: "
+            + ("the data line is held low. " if who == 0 else "nobody drives the data line. ")
+            + "Check the chip's supply (3.3 V), ground, and that the wires are short; then switch it off and on"
+        )
+    if who in _OTHERS:
+        return f"{reads}: an {_OTHERS[who]}, which has other registers"
+    if who in _ALIKE:
+        return (
+            f"{reads}: an {_ALIKE[who]}. accept_unknown=True uses it as one of the MPU6500 family, "
+            'without FIFO and auxiliary bus: DRIVE = "timer" or "data_ready"'
+        )
+    return f"{reads}; known are {known()}. {hint}. accept_unknown=True uses it as {what}"
 
 
 def index(what, value, allowed):
@@ -139,6 +181,7 @@ def divider(base_hz, rate):
 class Filters:
     """The digital low-pass filters and the sample rate of one part, checked and as register values.
 
+    own_accel         the part has ACCEL_CONFIG2, a filter of the accelerometer's own
     dlpf, accel_dlpf  as in Mpu.configure(); None: the widest of the gyro's that stays within half
                       the sample rate, and the accelerometer's that follows the gyro's
     rate              (num, den) Hz
@@ -148,7 +191,7 @@ class Filters:
     register) and smplrt_div are bits of registers, sample_rate the exact rate. Raises ValueError.
     """
 
-    def __init__(self, chip, family_6500, dlpf, accel_dlpf, rate):
+    def __init__(self, chip, family_6500, own_accel, dlpf, accel_dlpf, rate):
         choices = _CHOICES_6500 if family_6500 else _CHOICES
         gyro = _GYRO_6500 if family_6500 else _BOTH_6050
         accel = _ACCEL_6500 if family_6500 else _ACCEL_6050
@@ -162,7 +205,7 @@ class Filters:
             i = index("dlpf", dlpf, choices)
         j = i
         if accel_dlpf is not None:
-            if not family_6500:
+            if not own_accel:
                 raise ValueError(f"accel_dlpf: dlpf sets both filters of this {chip}")
             j = index("accel_dlpf", accel_dlpf, choices)
         base = 1000 if 0 < i < 7 else 32000 if i == _BYPASS else 8000
@@ -177,6 +220,6 @@ class Filters:
         self.delay_ms = max(gyro[i][1], accel[j][1])
         self.config = i & 7
         self.fchoice_b = i >> 3
-        self.accel_config2 = j if family_6500 else None  # ACCEL_FCHOICE_B is its bit 3
+        self.accel_config2 = j if own_accel else None  # ACCEL_FCHOICE_B is its bit 3
         self.smplrt_div = n - 1
         self.sample_rate = ratio((base, n))

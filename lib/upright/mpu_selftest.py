@@ -5,7 +5,7 @@
 import time
 from array import array
 
-from upright.mpu_fifo import unpack
+from upright.mpu_fifo import HEAD, SAME, SAME_TAKEN, STATUS, make_buffer, unpack
 
 _SMPLRT_DIV = 0x19
 _CONFIG = 0x1A
@@ -114,19 +114,20 @@ def _sums(imu, actuators, ranges, samples):
     time.sleep_ms(50)  # the filters (92 Hz) and the proof masses come to rest; AN 3 asks for 20 ms
     sums = [0] * 6
     counts = array("h", bytes(22))
-    raw = bytearray(16)  # see unpack()
-    burst = memoryview(raw)[1:]
+    raw = make_buffer(14)
+    burst = memoryview(raw)[STATUS:]
     for _ in range(samples):
         # a sample a millisecond; a chip that gives none is not waited for without end
         for _ in range(20):
             time.sleep_ms(1)
             imu.registers.read_registers(_INT_STATUS, burst)
-            if raw[1] & 1:
+            if raw[STATUS] & 1:
                 break
         else:
             raise imu.error_class("no sample in 20 ms during the self-test")
-        raw[1] = 1  # not what else INT_STATUS said
-        unpack(raw, 2, counts)
+        raw[STATUS] = 1  # not what else INT_STATUS said
+        raw[SAME] = SAME_TAKEN
+        unpack(raw, HEAD, counts)
         for i in range(6):
             sums[i] += counts[i]
     return sums

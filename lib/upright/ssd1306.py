@@ -424,9 +424,11 @@ class SSD1306(Canvas):
         if self._cs is None:
             self.bus.write(view)
             return
-        self._cs(0)
-        self.bus.write(view)
-        self._cs(1)
+        try:
+            self._cs(0)
+            self.bus.write(view)
+        finally:
+            self._cs(1)
 
 
 # micropython-lib's names: code that is moved over from there is told how to call this class

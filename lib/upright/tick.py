@@ -158,7 +158,8 @@ class Tick:
 
     `on_sample` and `on_fifo` are the callbacks: on_sample for a timer or the chip's data-ready line, on_fifo for a
     timer that drains the FIFO. (They are made once, because fetching a bound method allocates.) They never raise.
-    Faults are counted in `missed` (ticks that did not come; the filter coasts through them), `crashes` (the last one is
+    The filter coasts through packets that the FIFO has lost, as through ticks that did not come.
+    Faults are counted in `missed` (ticks that did not come), `crashes` (the last one is
     in `error`), `step_errors` (of on_step; the last one is in `step_error`), and in the counters of driver and display.
     A KeyboardInterrupt during the tick is stored in `interrupt`, for the main program to raise.
 
@@ -198,7 +199,10 @@ class Tick:
         self._due = ticks_us()
         self._started = False
         self._coasted_ahead = 0
-        self._owed = 0  # missed ticks still to be coasted through; then _coasted_ahead is not 0
+        # Steps still to be coasted through: of missed ticks (then _coasted_ahead is not 0), or of packets that the FIFO
+        # has lost, of which so many were known at the last tick
+        self._owed = 0
+        self._lost = imu.fifo_lost
         self._stepped = False  # in this tick
         self._running = False
         self._seen = -1
@@ -258,6 +262,11 @@ class Tick:
                     self._look_after()
                 if self._black_box is not None:
                     self._black_box.look()
+                lost = imu.fifo_lost
+                self._owed += (lost - self._lost) & _WRAP
+                self._lost = lost
+            if self._owed > 0:
+                self._make_up()
             while n > 0:
                 imu.fifo_next()  # a packet that is withheld after a reset is still a step: the filter coasts
                 if n == 1 and self._mag is not None:
@@ -368,6 +377,17 @@ class Tick:
             self._filter.update(self._counts)
             lost -= 1
 
+    def _make_up(self):
+        """Coast through packets that the FIFO has lost, a bounded number a tick."""
+        n = self._owed
+        if n > _MOST_COASTS:
+            n = _MOST_COASTS
+        self._owed -= n
+        self._counts[10] &= ~_ANY_FRESH
+        while n > 0:
+            self._filter.update(self._counts)
+            n -= 1
+
     @micropython.native
     def _step(self):
         """One step of the filter. Returns whether there is time for the display: not after a time-out of the bus, for
@@ -436,6 +456,7 @@ class Tick:
         """Call before stopped ticks go on: ticks of the pause are not counted as missed."""
         self._running = self._started = False
         self._coasted_ahead = self._owed = 0
+        self._lost = self._imu.fifo_lost
 
     # -- for programs, interrupts and a second core: nothing here allocates
     @property

@@ -27,6 +27,7 @@ class _Bus:
         self.cuts = 0  # transfers that began while another was under way
         self.spoilt = False
         self.stuck = False  # SDA or SCL is held low: every transfer times out
+        self.clocks = 0  # until a slave lets go of SDA, see hold_sda()
         self.swallows = (
             False  # as rp2 may: a written byte that is refused ends the transfer without an error
         )
@@ -346,6 +347,7 @@ class _Wire:
 
     def __init__(self):
         self.level = 0
+        self.held = None  # a bus whose SDA it is, while a slave holds that low
         self.chip = None  # a chip that drives it
         self.listeners = []  # called with (level, now) when the board drives it
         self.irq = None
@@ -399,7 +401,7 @@ class Pin:
                 if wire.chip:
                     wire.chip.poll(kernel.now())
                     wire.follow()
-                return wire.level
+                return 0 if wire.held and wire.held.stuck else wire.level
             level = 1 if x else 0
             if level != wire.level:
                 wire.set(level)
@@ -609,6 +611,22 @@ def wire_pin(pin, chip):
 def wire_reset(pin, chip):
     """A pin is the chip's reset input."""
     _wire(pin).listeners.append(chip.reset_pin)
+
+
+def hold_sda(bus_id, scl, sda, clocks=9):
+    """A chip that a reset of the board has cut off in a read holds SDA low, until it has seen so many clocks."""
+    bus = _i2c_bus(bus_id)
+    bus.stuck = True
+    bus.clocks = clocks
+    _wire(scl).level = _wire(sda).level = 1
+    _wire(sda).held = bus
+
+    def clocked(level, now):
+        if level and bus.clocks:
+            bus.clocks -= 1
+            bus.stuck = bus.clocks > 0
+
+    _wire(scl).listeners.append(clocked)
 
 
 def power_on(cause=PWRON_RESET, like="rp2"):

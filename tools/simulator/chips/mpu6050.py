@@ -87,8 +87,8 @@ class MPU6050Chip(Sensors):
         self._init_faults(now)
         self.world = world
         self.address = address
-        self.family_6500 = who_am_i != 0x68
-        self.fifo = PacketFifo(512 if self.family_6500 else 1024, fifo_byte_us)
+        self.family_6500 = self._of_6500(who_am_i)
+        self.fifo = PacketFifo(self._fifo_size(), fifo_byte_us)
         self.trims = trims or self._some_trims()
         self.broken = ()  # axes (0..5: accel x y z, gyro x y z) that do not react to self-test
         self.int_level = 0
@@ -104,6 +104,14 @@ class MPU6050Chip(Sensors):
         self._pointer = 0
         self._pointing = False
         self._power_on_reset()
+
+    # What clones do in another way (mpu_clone.py)
+
+    def _of_6500(self, who_am_i):
+        return who_am_i != 0x68
+
+    def _fifo_size(self):
+        return 512 if self.family_6500 else 1024
 
     # Observation, for tests; faults are in Faults
 

@@ -33,7 +33,7 @@ class MPU6500Chip(MPU6050Chip):
 
     accel_offsets   factory values of the accelerometer offset registers x y z, 15 bits (RM, registers 119 to 126)
 
-    The other arguments are MPU6050Chip's. On SPI:
+    With who_am_i 0x68 it is an MPU6000, an MPU6050 on SPI. The other arguments are MPU6050Chip's. On SPI:
     - mode 0 or 3 (PS 6.5); in any other it neither understands nor is understood
     - an address byte, bit 7 = read, then data; a burst steps through the registers
     - 1 MHz at most, but 20 MHz to read 0x3A (INT_STATUS) to 0x60 (the sensors and EXT_SENS_DATA);
@@ -61,7 +61,7 @@ class MPU6500Chip(MPU6050Chip):
     def _factory_values(self):
         MPU6050Chip._factory_values(self)
         self._power_ups()
-        for i in range(3):
+        for i in range(3 if self.family_6500 else 0):
             value = self.accel_offsets[i] << 1
             self._registers[_XA_OFFSET_H + 3 * i] = value >> 8 & 0xFF
             self._registers[_XA_OFFSET_H + 3 * i + 1] = value & 0xFF
@@ -83,7 +83,7 @@ class MPU6500Chip(MPU6050Chip):
     def _measure(self):
         words = MPU6050Chip._measure(self)
         r = self._registers
-        for i in range(3):
+        for i in range(3 if self.family_6500 else 0):
             at = _XA_OFFSET_H + 3 * i
             offset = (r[at] << 8 | r[at + 1]) >> 1
             change = ((offset - self.accel_offsets[i] + 0x4000) & 0x7FFF) - 0x4000
@@ -123,8 +123,9 @@ class MPU6500Chip(MPU6050Chip):
         self._spi_only = bool(bit)
 
     def _user_ctrl(self, value):
-        # RM, register 106: I2C_IF_DIS clears itself (and is in force all the same)
-        return MPU6050Chip._user_ctrl(self, value) & ~0x10
+        # RM, register 106: I2C_IF_DIS clears itself (and is in force all the same); the MPU6000's stays (RM-6000 4.27)
+        value = MPU6050Chip._user_ctrl(self, value)
+        return value & ~0x10 if self.family_6500 else value
 
     # SPI
 
