@@ -218,7 +218,7 @@ class Fifo:
         return self.drain(packets if packets < self.batch else self.batch, level)
 
     def _stands(self, level):
-        """Was the FIFO as full as this, with a part of a packet, at the last polls? Then it is smaller than believed."""
+        """Was it as full as this, with a part of a packet, at the last polls? Then it is smaller than believed."""
         level += self.level * self.packet
         self._parts = self._parts + 1 if level == self._part else 0
         self._part = level
