@@ -611,7 +611,7 @@ class Mpu(Counters):
         registers.write_register(_INT_ENABLE, 0)
         raw = self._raw
         registers.read_registers(_INT_STATUS, self._burst)
-        time.sleep_ms(max(self.settle_ms - 2, period_ms + 1))
+        time.sleep_ms(max(self.settle_ms - 1, period_ms + 1))
         registers.read_registers(_INT_STATUS, self._burst)
         always = raw[STATUS] & _DATA_RDY
         registers.write_register(_INT_ENABLE, _DATA_RDY)
