@@ -1,4 +1,4 @@
-# Upright: attitude (roll, pitch, yaw) from an MPU6050, or from an MPU6500 with an IST8310.
+# Upright: attitude (roll, pitch, yaw) from an MPU6050, MPU6500 or MPU9250, with a magnetometer or without one.
 #
 #     import upright
 #     imu = upright.start()
