@@ -1,6 +1,7 @@
 """The face: AHRS and start() on the simulated machine, what they give, what they refuse, and what they survive."""
 
 import importlib.util
+import json
 import math
 import sys
 from array import array
@@ -12,6 +13,7 @@ import upright
 from chips.ist8310 import IST8310Chip
 from chips.mpu6050 import MPU6050Chip
 from chips.mpu6500 import MPU6500Chip
+from chips.mpu_clone import MPU6050Clone
 from conftest import ROOT
 from upright import ahrs, calibration, timing
 from upright.auxiliary_bus import AuxiliaryBus
@@ -767,3 +769,25 @@ def test_a_bus_that_is_stuck_for_a_while_costs_no_turn(drive):
     turned = 360 * (imu.turns() - before)
     assert abs(turned - 50 * (kernel.now() - began) / 1e6) < 2
     assert imu.status()["errors"] > 0 and world
+
+
+@pytest.mark.parametrize("fault", ["wire", "zeros"])
+def test_a_sensor_that_is_gone_neither_rests_nor_overwrites_a_good_bias(fault, tmp_path):
+    path = tmp_path / "upright_cal.json"
+    world = StillWorld((0, 0, G, 20, -12, 7))
+    world.start(0)
+    model = MPU6050Clone(world)
+    machine.wire_i2c(0, model, 5, 4)
+    kernel.advance(200000)
+    imu = upright.AHRS(MPU6050(bus()), measure_bias=False, log=None, calibration=str(path)).start()
+    run(6)
+    imu.bias.keep(11)
+    good = json.loads(path.read_text())
+    model.vanish() if fault == "wire" else model.zeros()
+    imu.filter.set_bias(256, -256, 0)  # nonsense, as it was learnt from no samples
+    for _ in range(3):
+        run(0.5)
+        imu.bias.keep(700)
+        imu.angles()
+    assert json.loads(path.read_text()) == good
+    assert imu.status()["at_rest"] is False

@@ -627,7 +627,7 @@ class AHRS:
             "magnetometer_lost": filter.AXES == 9 and mag_lost,
             "bias_known": self.bias.known,
             "bias_dps": tuple([b / 1000 for b in bias]),
-            "at_rest": getattr(filter, "resting", None),
+            "at_rest": filter.resting and not lost if hasattr(filter, "resting") else None,
             "field_accepted": None
             if filter.AXES < 9
             else not mag_lost and getattr(filter, "mag_accepted", True),

@@ -30,7 +30,7 @@ BOXES = {
     "sensors": (330, 500, ["upright/mpu*", "upright/dmp*"]),
     "magnetometers": (640, 500, ["upright/auxiliary_bus", "upright/magnetometer*", "upright/ist8310", "upright/ak8963",
                                  "upright/hmc5883l", "upright/qmc5883l"]),
-    "buses": (640, 650, ["upright/registers"]),
+    "buses": (640, 650, ["upright/registers", "upright/i2c_bus"]),
 }  # fmt: skip
 LIB = "lib/upright"  # the frame around the boxes of that folder
 
