@@ -4,6 +4,8 @@ The bounds are in upright_host/faults.py.
 """
 
 import json
+import random
+from collections import Counter
 from pathlib import Path
 
 import hypothesis
@@ -117,6 +119,76 @@ def test_an_attitude_that_stays_off_is_named(rig):
     said = " ".join(faults.judge(case, faulty, rig.clean(case)))
     assert "the inclination is" in said
     assert "the yaw is" in said
+
+
+# -- a day
+
+
+def day(seed, seconds):
+    """Faults at random times that do not overlap, each with all that the counters have to say of it."""
+    r = random.Random(seed)
+    at, plan = 4 * SECOND, []
+    while True:
+        at += r.randint(2 * SECOND, 12 * SECOND)
+        lasts = r.randint(1000, SECOND)
+        if at + lasts > (seconds - 4) * SECOND:
+            return plan
+        on, name, *values = r.choice(
+            [
+                ("imu", "nack", r.randint(1, 20), r.randint(0, 20)),
+                ("imu", "brown_out"),
+                ("imu", "unplugged"),
+                ("imu", "silent"),
+                ("imu", "jam"),
+                ("imu", "flip", 0x6B, 0x40),
+                ("bus", "raise", r.choice(["ValueError", "MemoryError"])),
+                ("bus", "low", r.choice(["sda", "scl"])),
+                ("board", "raise_in_on_step", "ValueError"),
+                ("board", "no_ticks"),
+                ("board", "masked"),
+                ("board", "hang"),
+                ("board", "disk_full"),
+                ("display", "silent"),
+                ("display", "unplugged"),
+                ("display", "nack", r.randint(1, 5)),
+            ]
+        )
+        moment = FAULTS.FAULTS[name][1] is None
+        plan.append([at, on, name, None if moment else lasts, *values])
+        at += 0 if moment else lasts
+
+
+@pytest.mark.soak
+@pytest.mark.slow
+@pytest.mark.parametrize("part", range(6))
+def test_a_day_of_faults_ends_with_every_counter_as_it_was_injected(part, soaking):
+    """make soak runs 6 parts of 4 hours, make test 6 of 10 minutes. The clocks of each part wrap after 2 minutes."""
+    seconds = 4 * 3600 if soaking else 600
+    plan = day(part, seconds)
+    result = simulate.run(
+        simulate.best_runtime(),
+        simulate.FIRMWARE,
+        {
+            "seconds": seconds,
+            "faults": plan,
+            "board": {"RATE": 100, "SENSOR_RATE_HZ": None, "KEEP_BIAS": False},
+            "begin_us": (1 << 30) * 1000 - 120 * SECOND,
+        },
+    )
+    happened = Counter(name if on != "display" else "" for _, on, name, *_ in plan)
+    assert result["errors"] == result["failed"]["104"]  # 0x68: transfers that the bus refused
+    assert result["display_errors"] == result["failed"]["60"]  # 0x3c
+    assert result["missed"] == result["ticks_lost"]
+    assert result["crashes"] == happened["raise"]
+    assert result["step_errors"] == happened["raise_in_on_step"]
+    assert result["resets"] == sum(happened[name] for name in ("brown_out", "unplugged", "flip"))
+    assert result["full_resets"] == happened["jam"]
+    assert (result["uncaught"], result["cuts"], result["display_misuse"]) == (0, 0, [])
+    assert result["longest_tick_us"] <= 2 * result["period_us"] + result["timeout_us"]
+    # the attitude at the end is the one at rest
+    assert max(abs(angle) for angle in result["angles_mdeg"][:2]) < 1000
+    changes = result["changes"]
+    assert not changes or not changes[-1][2], "the sensor is lost for ever"
 
 
 # -- random plans

@@ -31,8 +31,10 @@ class Irq:
         self.on_error = None  # called when an exception escapes a hard callback
 
     def request(self):
+        global irqs_lost
         if self.pending:
             self.lost += 1
+            irqs_lost += 1
             return
         self.pending = True
         (_hard if self.hard else _soft).append(self)
@@ -48,7 +50,7 @@ def reset():
     """A fresh machine: time 0, nothing scheduled."""
     global _now, _in_irq, _in_soft, _masked, _next, _sources, _hard, _soft, _stop_us, _busy
     global irq_cost_us, after_irq, uncaught, irq_count, reset_request, _locked
-    global longest_irq_us, main_exception
+    global longest_irq_us, main_exception, irqs_lost
     _now = 0
     _in_irq = False
     _in_soft = False
@@ -64,6 +66,7 @@ def reset():
     after_irq = None  # the harness's observer, called after every hard callback, heap unlocked
     uncaught = []  # exceptions that escaped a hard callback
     irq_count = 0
+    irqs_lost = 0  # of all of them
     longest_irq_us = 0  # of the hard callbacks
     reset_request = None
     main_exception = None  # raised in the main program at its next step: Ctrl-C

@@ -265,7 +265,7 @@ def finish(imu, recorder, parts):
         "longest_tick_us": kernel.longest_irq_us,
         "timeout_us": max([bus.timeout_us for bus in buses]),
         "failed": {str(address): n for bus in buses for address, n in bus.failed.items()},
-        "dropped": machine.Timer.dropped,
+        "ticks_lost": machine.Timer.dropped + kernel.irqs_lost,
         "heap_checked": sys.implementation.name == "micropython",
         "started": False,
     }
