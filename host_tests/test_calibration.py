@@ -507,6 +507,8 @@ class PowerFailure(Exception):
 class Disk:
     """A file system whose power fails before the step of that number; what was not synced is then cut in half."""
 
+    piece = None  # bytes that are written in a step; None: half of what is to be written
+
     def __init__(self, files, replaces, fails_at=None, syncs=True):
         self.files = dict(files)
         self.replaces = replaces
@@ -558,8 +560,8 @@ class Written:
         self.disk, self.name = disk, name
 
     def write(self, data):
-        half = len(data) // 2
-        for part in (data[:half], data[half:]):
+        size = self.disk.piece or max(1, len(data) // 2)
+        for part in [data[i : i + size] for i in range(0, len(data), size)]:
             self.disk.unsynced.add(self.name)
             self.disk.step()
             self.disk.files[self.name] += part
@@ -647,6 +649,25 @@ def test_whenever_the_power_fails_the_old_or_the_new_file_is_found(
             second = found(again, monkeypatch)
             assert second == NEW if done else second in (first, NEW)
     assert n > 6
+
+
+@pytest.mark.parametrize("replaces", [True, False], ids=["replacing", "fat"])
+@pytest.mark.parametrize("start", ["a file", "only the new one"])
+def test_the_power_may_fail_at_every_byte_of_a_write(start, replaces, monkeypatch):
+    monkeypatch.setattr(Disk, "piece", 1)
+    files, old = STARTS[start]
+    wanted = len(with_checksum(NEW))
+    tried = 0
+    while True:
+        disk = Disk(files, replaces, tried, False)
+        try:
+            on(disk, monkeypatch, lambda: calibration.write("c", NEW))
+            break
+        except PowerFailure:
+            assert found(disk.files, monkeypatch) in (old, NEW)
+        tried += 1
+    assert tried > wanted
+    assert found(disk.files, monkeypatch) == NEW
 
 
 def test_a_writer_that_is_not_careful_is_found_out(monkeypatch):

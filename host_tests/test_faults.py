@@ -5,13 +5,14 @@ The bounds are in upright_host/faults.py.
 
 import json
 import random
+import re
 from collections import Counter
 from pathlib import Path
 
 import hypothesis
 import pytest
 from hypothesis import strategies as st
-from upright_host import faults, library, simulate
+from upright_host import faults, library, paths, simulate
 from upright_host.fault_plans import PLANS, SECOND, Case
 
 # Random plans that broke a bound, shrunk; what they found is mended
@@ -250,3 +251,15 @@ def test_random_plans_are_within_the_bounds(plan, rig):
 @pytest.mark.parametrize("drive, plan", KEPT)
 def test_what_random_plans_found_stays_mended(drive, plan, rig):
     bounds_hold(plan, drive, rig)
+
+
+def test_the_page_has_every_plan_in_its_tables():
+    page = (paths.ROOT / "docs" / "reliability.md").read_text()
+    cells = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
+    named = re.findall(r"`([a-z0-9-]+)`", " ".join(cells))
+    assert sorted(named) == sorted(PLANS)
+
+
+def test_the_page_tells_of_gaps_while_there_are_some():
+    page = (paths.ROOT / "docs" / "reliability.md").read_text()
+    assert ("## What falls short" in page) == any(case.gap for case in PLANS.values())

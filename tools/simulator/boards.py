@@ -72,7 +72,8 @@ def _i2c_board(name, board, world, options):
             machine.wire_i2c(bus, display, scl, sda)
         else:
             machine.wire_i2c(bus + 1, display)
-    return Parts(imu, mag, display, [machine.I2C(bus)._bus, machine.I2C(bus + 1)._bus])
+    buses = [machine.I2C(number, timeout=0)._bus for number in (bus, bus + 1)]
+    return Parts(imu, mag, display, buses)
 
 
 def _robomaster_a(name, board, world, options):
