@@ -58,6 +58,9 @@ _TIME_OUT_US = const(2500)
 # Attempts to read one set. If 100 steps cut into as many, the tick leaves no time for a program
 _TRIES = const(100)
 
+# _running: False, True from the beginning of a tick on, and this after its step
+_STEPPED = const(2)
+
 # What _publish returns
 _HEALTH_DUE = const(1)
 _CALL_ON_STEP = const(2)
@@ -203,7 +206,6 @@ class Tick:
         # has lost, of which so many were known at the last tick
         self._owed = 0
         self._lost = imu.fifo_lost
-        self._stepped = False  # in this tick
         self._running = False
         self._seen = -1
         self._state = array("i", [0] * _WORDS)
@@ -224,6 +226,14 @@ class Tick:
         self.step_errors = 0
         self.step_error = None
         self.interrupt = None
+        # Methods that ticks call are looked up once, see mpu_monitor.Monitor. (With all of these the table of
+        # attributes has grown to its next size, 47, and is far from full.)
+        self._on_time = self._on_time
+        self._step = self._step
+        self._call_on_step = self._call_on_step
+        self._without_sample = self._without_sample
+        self._crashed = self._crashed
+        self._look_after = self._look_after
         self.on_sample = self._on_sample
         self.on_fifo = self._on_fifo
         self.on_guard = self._on_guard
@@ -233,7 +243,6 @@ class Tick:
         if self._running:  # another source of the same tick, at a higher priority
             return
         self._running = True
-        self._stepped = False
         try:
             if self._on_time():
                 self._imu.read()
@@ -250,8 +259,7 @@ class Tick:
     def _on_fifo(self, source):
         if self._running:
             return
-        self._running = True
-        self._stepped = False
+        self._running = _STEPPED  # until there is a packet
         try:
             imu = self._imu
             began = ticks_us()
@@ -271,7 +279,7 @@ class Tick:
                 imu.fifo_next()  # a packet that is withheld after a reset is still a step: the filter coasts
                 if n == 1 and self._mag is not None:
                     self._mag.read(self._raw)
-                self._stepped = False
+                self._running = True
                 self._step()
                 n -= 1
             if well and self._display is not None:
@@ -312,7 +320,7 @@ class Tick:
     @micropython.native
     def _crashed(self, error):
         self._count_crash(error)
-        if not self._stepped:  # a step is always one step
+        if self._running != _STEPPED:  # a step is always one step
             try:
                 self._counts[10] &= ~_ANY_FRESH
                 self._filter.update(self._counts)
@@ -397,7 +405,7 @@ class Tick:
             self._calibration.apply(self._raw)
         self._filter.update(counts)
         due = _publish(self._state, self._q, counts)
-        self._stepped = True
+        self._running = _STEPPED
         if due:
             if due & _CALL_ON_STEP:
                 self._call_on_step()
