@@ -26,7 +26,7 @@ _O = const(17)  # 3, Q31: minus the bias as a half angle per step
 _OR = const(20)  # 3, Q46: its last bits, -32767..32767
 _TURN = const(23)  # 3, Q31: correction that the next step takes up, earth frame, half angle
 _R = const(26)  # 9, Q15: rotation matrix; its rows are north, west, up in the body
-_FORCE = const(35)  # 3, Q15: specific force of this sample in the earth frame, counts
+_FS = const(35)  # 3, Q9: specific force in the earth frame, counts, summed over the block
 _BASE = const(38)  # 3, Q8: gyro bias that was set, counts
 _O_BASE = const(41)  # 3, Q31: O of BASE alone
 _OR_BASE = const(44)  # 3, Q46: its last bits
@@ -69,7 +69,7 @@ _ATAN = array("i", [
 # ------------------------------------------------------------------------------------------ every step
 @micropython.viper
 def to_earth(s: ptr32, counts: ptr16):
-    """R of Q; FORCE, the specific force in the earth frame; a fresh magnetometer sample goes into the sum MS, MN.
+    """R of Q; the specific force in the earth frame goes into the sum FS, a fresh magnetometer sample into MS, MN.
 
     The accelerometer is used as measured, neither normalised nor left out at full scale, so that swings cancel. A
     magnetometer sample is left out when all of it is zero or an axis is at full scale.
@@ -84,14 +84,14 @@ def to_earth(s: ptr32, counts: ptr16):
     x = ((counts[0] & 0xFFFF) ^ 0x8000) - 0x8000
     y = ((counts[1] & 0xFFFF) ^ 0x8000) - 0x8000
     z = ((counts[2] & 0xFFFF) ^ 0x8000) - 0x8000
-    # north: 1 - 2 (c c + d d), 2 (b c - a d), 2 (b d + a c); FORCE = R accel
+    # north: 1 - 2 (c c + d d), 2 (b c - a d), 2 (b d + a c); FS += R accel
     m = 32768 - ((c * c + d * d + 8192) >> 14)
     n = (b * c - a * d + 8192) >> 14
     o = (b * d + a * c + 8192) >> 14
     s[_R] = m
     s[_R + 1] = n
     s[_R + 2] = o
-    s[_FORCE] = m * x + n * y + o * z
+    s[_FS] = s[_FS] + (m * x + n * y + o * z + 32 >> 6)
     # west
     m = (b * c + a * d + 8192) >> 14
     n = 32768 - ((b * b + d * d + 8192) >> 14)
@@ -99,7 +99,7 @@ def to_earth(s: ptr32, counts: ptr16):
     s[_R + 3] = m
     s[_R + 4] = n
     s[_R + 5] = o
-    s[_FORCE + 1] = m * x + n * y + o * z
+    s[_FS + 1] = s[_FS + 1] + (m * x + n * y + o * z + 32 >> 6)
     # up
     m = (b * d - a * c + 8192) >> 14
     n = (c * d + a * b + 8192) >> 14
@@ -107,7 +107,7 @@ def to_earth(s: ptr32, counts: ptr16):
     s[_R + 6] = m
     s[_R + 7] = n
     s[_R + 8] = o
-    s[_FORCE + 2] = m * x + n * y + o * z
+    s[_FS + 2] = s[_FS + 2] + (m * x + n * y + o * z + 32 >> 6)
     if counts[10] & 2 == 0 or s[_NINE] == 0:
         return
     # MS += R mag
@@ -248,6 +248,7 @@ class EarthFilter(Attitude):
     bounds(p)              the largest learnt bias in 1e-6 deg/s, and the part of 1 rad (Q31) that corrections use
     set_up(p, given)       the filter's own words; p: parameters in millionths; given: those that were given, as given
     bias_is_new(known_s)   a bias was set: drop the learnt one
+    BLOCKS_HZ, LEAST_HZ    blocks a second, at most; the lowest rate
     bias_unit              (num, den): gyro counts of one unit of B
     """
 
@@ -271,12 +272,12 @@ class EarthFilter(Attitude):
                 raise TypeError("no parameter %r; there are %s" % (name, ", ".join(sorted(p))))
         num, den = self.rate
         scale, per = self.gyro_scale
-        shift = 2  # a block: at least 4 steps, 22 to 44 ms
-        while num >= 45 * den << shift:
+        shift = 2  # a block: at least 4 steps, and 1 / BLOCKS_HZ
+        while num >= self.BLOCKS_HZ * den << shift:
             shift += 1
         text = hertz(self.rate)
-        if shift > 5 or num < 50 * den:
-            raise ValueError("rate is %s, expected 50..1439 Hz" % text)
+        if num >= 1440 * den or num < self.LEAST_HZ * den:
+            raise ValueError("rate is %s, expected %d..1439 Hz" % (text, self.LEAST_HZ))
         gain = fixmath.ratio(fixmath.PI_NUM * den * per << 46, fixmath.PI_DEN * 360 * num * scale)
         s[_G] = gain >> 15
         s[_GR] = gain & 32767
@@ -292,7 +293,7 @@ class EarthFilter(Attitude):
                 "rate is %s, expected %d..%d Hz at %d/%d LSB per deg/s: choose another rate or gyro range"
                 % (
                     text,
-                    max(50, -(-turn_most * num // (den * (_STEP_MAX - room)))),
+                    max(self.LEAST_HZ, -(-turn_most * num // (den * (_STEP_MAX - room)))),
                     min(1439, (gain * num // den) >> 17),
                     scale,
                     per,

@@ -1,5 +1,5 @@
-# The inertial-frame Mahony filter in 32-bit integers: sensor counts in, quaternion out, which estimates the gyro bias
-# and rejects a disturbed magnetic field. Needs fixmath.py, earth_kernels.py, inertial_kernels.py and the viper emitter.
+# The inertial-frame Mahony filter in 32-bit integers: sensor counts in, quaternion out. It estimates the gyro bias and
+# judges the magnetic field. Needs fixmath.py, earth_kernels.py, inertial_kernels.py and the viper emitter.
 # update() is made for a hard interrupt: it allocates nothing, raises nothing, uses no float, and gives the same bits on
 # every port.
 
@@ -7,17 +7,29 @@ import micropython
 from micropython import const
 
 from upright import fixmath
-from upright.earth_kernels import MILLION, EarthFilter, compass, fine_mantissa, low_pass, to_earth
+from upright.earth_kernels import (
+    MILLION,
+    EarthFilter,
+    compass,
+    fine_mantissa,
+    low_pass,
+    to_earth,
+)
 from upright.fixmath import turn
 from upright.inertial_kernels import (
+    apply,
+    close,
     detect_rest,
+    grow,
     judge_field,
-    learn,
     level,
-    ramp,
+    measure_bias,
+    measure_heading,
+    open_heading,
+    pace,
     regress,
     smooth_field,
-    steer,
+    take,
 )
 
 # -- words of the state: written by tools/upright_host/words.py
@@ -30,80 +42,117 @@ _O = const(17)
 _OR = const(20)
 _TURN = const(23)
 _R = const(26)
-_BASE = const(38)
+_FS = const(35)
 _NINE = const(50)
 _BLOCK = const(51)
-_BLOCK_MASK = const(52)
 _PHASE = const(53)
 _GS = const(55)
 _MS = const(58)
 _SINCE = const(62)
 _J = const(63)
-_IN = const(67)
+_REST_AFTER = const(89)
+_REST_K = const(90)
 _REST_MOST = const(93)
-_SEEN = const(94)
-_S = const(97)
-_N = const(106)
-_N_RAMP = const(107)
-_N_LATE = const(108)
-_N_END = const(109)
-_LATE = const(110)
-_RAMP = const(111)
-_K_END = const(112)
-_K_END_SHIFT = const(113)
-_NORM = const(114)
-_G1 = const(115)
-_LI = const(116)
-_OM_GAIN = const(117)
-_X = const(118)
-_OM = const(134)
-_U = const(135)
-_INFO = const(138)
-_II = const(141)
-_INFO_LEAST = const(144)
-_INFO_KNOWN = const(145)
-_INFO_DECAY = const(146)
-_RATE_T = const(147)
-_REST_OFF = const(148)
-_UPSET = const(149)
-_B_SHIFT = const(150)
-_B_MAX = const(151)
-_C = const(152)
-_CC = const(155)
-_CC_SHIFT = const(156)
-_TURN_MAX = const(157)
-_REJECTED = const(167)
-_WEIGHT = const(168)
-_TOL = const(169)
-_SMOOTH = const(170)
-_REF = const(171)
-_FIELD_AFTER = const(172)
-_FIELD_FIRST = const(173)
-_FIELD_NEW = const(174)
-_REJECT_FOR = const(175)
-_TURNING_MIN = const(176)
-_AGREE = const(177)
-_HN = const(178)
-_LOST = const(179)
-_FAR_MIN = const(180)
-_RESTART_AFTER = const(181)
-_HRAMP = const(182)
-_HK = const(183)
-_HK_DOUBT = const(184)
-_LIMIT_AFTER = const(185)
-_PUSH = const(186)
-_ZK = const(187)
-_PUSH_MAX = const(188)
-_HC = const(189)
-_HC_SHIFT = const(190)
-_DOUBT = const(191)
-_DOUBT_RATE = const(192)
-_LITE = const(193)
-_GAP = const(194)
-_OUTAGE = const(195)
-_WORDS = const(196)
+_TWO_MASK = const(94)
+_LEVEL = const(95)
+_LEVEL_MASK = const(96)
+_REGRESS = const(97)
+_PART = const(98)
+_PACE = const(99)
+_GG = const(100)
+_FULL = const(103)
+_CLIPS = const(104)
+_CLIPPED = const(105)
+_CLIP = const(106)
+_OUTAGE = const(107)
+_SEEN = const(108)
+_HELD_K = const(116)
+_S = const(117)
+_OFF = const(120)
+_SF = const(122)
+_SF_K = const(124)
+_LEAN_G = const(125)
+_LEAN = const(126)
+_LEAN_AFTER = const(127)
+_AGAIN = const(132)
+_N = const(133)
+_N_LATE = const(134)
+_N_FULL = const(135)
+_N_END = const(136)
+_RAMP = const(137)
+_K_PACE = const(138)
+_K_START = const(139)
+_K_LEAST = const(140)
+_K_MOST = const(141)
+_K_TURN = const(142)
+_NORM = const(143)
+_G1 = const(144)
+_LI = const(145)
+_OM_GAIN = const(146)
+_X = const(147)
+_D = const(159)
+_OM = const(160)
+_REST_OFF = const(161)
+_UPSET = const(162)
+_JUMP = const(163)
+_SOON = const(164)
+_WAIT = const(165)
+_WAIT_MOST = const(166)
+_WAIT_FIELD = const(167)
+_WAIT_SURE = const(168)
+_WAIT_TURN = const(170)
+_WAIT_MOVED = const(174)
+_GYRO = const(175)
+_B_SHIFT = const(176)
+_B_MAX = const(177)
+_B_UNIT = const(178)
+_B_INVERSE = const(179)
+_P = const(180)
+_DX = const(196)
+_P_REST = const(207)
+_P_KNOWN = const(208)
+_P_VAGUE = const(209)
+_P_SET = const(210)
+_Q_HEADING = const(211)
+_Q_SCALE = const(212)
+_Q_SCALE_SHIFT = const(213)
+_Q_LEVEL = const(214)
+_Q_UP = const(215)
+_GROW = const(216)
+_R_TILT = const(217)
+_R_REST = const(218)
+_R_MAG = const(219)
+_CC = const(223)
+_C = const(224)
+_FOR_MOST = const(237)
+_BACK_AFTER = const(241)
+_STILL_SET = const(244)
+_STILL_K = const(245)
+_STEADY_MOST = const(247)
+_OWN = const(248)
+_LOST = const(249)
+_RESTART_AFTER = const(250)
+_WEIGHT = const(251)
+_TOL = const(252)
+_SAME = const(253)
+_SMOOTH = const(254)
+_REF = const(255)
+_FIELD_AFTER = const(256)
+_FIELD_FIRST = const(257)
+_FIELD_NEW = const(258)
+_NEED = const(259)
+_NEED_MOST = const(260)
+_TURNING_MIN = const(261)
+_GATE = const(262)
+_DOUBT = const(264)
+_GAP = const(265)
+_LAST = const(266)
+_WORDS = const(269)
 # -- end of the words
 
+_HALF = const(536870912)  # 1/2, Q30: no variance is more
+_OPEN = const(515396076)  # 3 rad**2 in units of (2.5 rad)**2, Q30: nothing is known of the heading
+_PARTS = const(8)
 _PI28 = const(843314857)  # pi, Q28
 
 
@@ -112,9 +161,10 @@ class Inertial9(EarthFilter):
 
     After R. Mahony, T. Hamel, J.-M. Pflimlin, IEEE TAC 53(5), 2008, with the acceleration low-passed in the earth
     frame (an idea of VQF: D. Laidig, T. Seel, Information Fusion 91, 2023), so that swings and shakes cancel before
-    they count as tilt. The gyro bias is estimated at rest and in motion, with a gain that falls as it becomes known.
-    The magnetometer turns only the heading, at a bounded rate, and only while the field is like its reference. Raw
-    counts are enough: no calibration before, one set of parameters.
+    they count as tilt. A Kalman filter of four errors, the heading and the three biases, gives the rest: the
+    accelerometer's corrections show the biases, the magnetometer the heading, a rest the bias itself. The magnetometer
+    never tilts, and is believed only as far as the gyro can explain what it says. Raw counts are enough: no calibration
+    before, one set of parameters.
 
     rate              samples per second: int, or (num, den) for num/den Hz
     gyro_scale        (num, den): exact LSB per deg/s
@@ -122,44 +172,55 @@ class Inertial9(EarthFilter):
 
     parameters        by name, see PARAMETERS; taken to six significant digits
 
-    A steady rotation from power-on looks like a bias and is taken for one, up to bias_limit_dps, until the first 1.5 s
-    at rest.
+    A steady rotation from power-on looks like a bias and is taken for one, up to bias_limit_dps, until it ends; after a
+    rest, it is once it has lasted as long as the rest, rest_wait at the most. With nine axes the magnetometer tells a
+    turn from a bias.
 
     Raises ValueError for a rate, scale or parameter that the numbers cannot hold, with the range that they can:
-    82 to 1439 Hz at +-2000 deg/s, from 50 Hz on at +-1000 deg/s and less.
+    20 to 1439 Hz at +-500 deg/s and less, from 46 Hz on at +-1000, from 91 Hz on at +-2000 deg/s.
 
     state: array('i'); state[QUATERNION] and the next three words are w x y z in Q29.
     """
 
     NAME = "inertial9"
     AXES = 9
-    LITE = False  # True: no rejection of fields, no restart of the heading
+    BLOCKS_HZ = 23  # a block takes 44 to 88 ms, below 46 Hz 4 steps
+    LEAST_HZ = 20
     # name: (default, least, most); times in s, angles in rad
     # fmt: off
     PARAMETERS = {
-        "tau_tilt": (3, 0.5, 30),  # time constant of the tilt correction
-        "tau_heading": (10, 1, 100),  # the same for the heading
-        "tau_doubt": (2, 1, 100),  # the same while nothing is known of the vertical bias; with knowledge it grows
-        "ramp_tilt": (0.5, 0.1, 4),  # at the start the time constants are this times the time since, in 1/256
-        "ramp_heading": (0.75, 0.1, 4),
-        "bias_after": (5, 0, 60),  # no bias estimation in motion before this time
-        "bias_limit_dps": (6, 0.5, 25),  # a bias is no larger than this (on top of set_bias), deg/s
+        "tau_start": (2.4, 0.5, 30),  # time constant of the tilt correction while little is known of the bias
+        "tau_fast": (3.2, 0.5, 30),  # its least afterwards ...
+        "tau_slow": (20, 1, 100),  # ... and its most
+        "tau_turning": (4.4, 0.5, 50),  # between them it falls with the root of the turn rate: this is it at 100 deg/s
+        "ramp_tilt": (0.65, 0.1, 4),  # at the start it is this times the time since, in 1/256
+        "accel_doubt_g": (0.16, 0.1, 2),  # a deviation of so much halves what the tilt tells about the bias
+        "bias_after": (0.3, 0, 60),  # no bias estimation in motion before this time ...
+        "bias_full": (7, 0.5, 60),  # ... and at less than full weight before this
+        "bias_limit_dps": (25, 0.5, 25),  # a bias is no larger than this (on top of set_bias), deg/s
+        "bias_start_dps": (4, 1, 10),  # what is known of it at the start: its standard deviation
+        "bias_walk": (0.003, 0.0005, 0.1),  # it changes by so much, deg/s per root s ...
+        "bias_walk_level": (0.0525, 0.0005, 0.5),  # ... and a horizontal one by this, for the gyro's scale is off, too
+        "tilt_noise": (2.8, 0.5, 20),  # of a tilt correction as a bias, deg/s root s
+        "rest_noise": (0.05, 0.02, 1),  # of the gyro at rest, deg/s root s
+        "mag_noise": (0.26, 0.05, 0.5),  # of the heading, rad root s
+        "scale_error": (0.0034, 0.0005, 0.02),  # the heading walks by this times the turn rate, root s
         "rest_gyro_dps": (2, 0.1, 10),  # at rest the gyro stays this near to its average, deg/s
         "rest_accel_g": (0.051, 0.01, 0.1),  # and the accelerometer this near to its own, g
         "rest_after": (1.5, 0.2, 10),  # for this long
-        "rest_dps": (0.5, 0.05, 5),  # a well-known bias does not change by more: a slow turn is not rest, deg/s
-        "upset_g": (0.25, 0.1, 2),  # a tilt error at rest, as its sine, that restarts the ramps
-        "field_tolerance": (0.2, 0.02, 0.7),  # a field that differs by less is the reference's, as a part of it
+        "rest_dps": (0.3, 0.05, 5),  # a rest that differs by more from a known bias is not believed at once, deg/s
+        "rest_wait": (12, 1.5, 60),  # but when it has lasted as long as the rest before, at most this
+        "upset_g": (0.25, 0.1, 2),  # a tilt error at rest, as its sine, that restarts the ramp
+        "lost_g": (0.6, 0.3, 2),  # a horizontal force of more for 2 s restarts it, too
+        "field_tolerance": (0.15, 0.02, 0.7),  # a field that differs by less is the reference's, as a part of it
         "field_after": (0.3, 0, 10),  # for this long
-        "field_tau": (20, 1, 100),  # time constant with which the reference follows
+        "field_tau": (33, 1, 100),  # time constant with which the reference follows
         "field_first": (5, 0, 100),  # a field that stays the same for this long is the first reference
-        "field_new": (20, 1, 1000),  # the same for another one, counted while turning
+        "field_new": (20, 1, 1000),  # the same for another one with the same heading, counted while turning
         "field_dps": (20, 1, 30),  # turning: faster than this, deg/s
-        "field_agree": (0.5, 0.05, 3.14),  # a new reference's north is no further from the gyro's than this
-        "reject_for": (60, 0, 1000),  # rejected for longer, a field counts half
-        "restart_rad": (0.55, 0.1, 3.14),  # a heading error that a good field does not explain
-        "restart_after": (5, 0.5, 100),  # restarts the heading's ramp when it lasts this long
-        "outage": (0.5, 0.05, 10),  # so long without a fresh sample restarts both ramps
+        "field_gate": (0.3, 0.05, 3),  # a heading error that is believed, beside what the gyro may be off by
+        "restart_after": (8, 0.5, 100),  # a larger one in the same field restarts the heading after this; at rest twice
+        "outage": (0.5, 0.05, 10),  # so long without a fresh sample restarts tilt and heading
     }
     # fmt: on
 
@@ -168,92 +229,168 @@ class Inertial9(EarthFilter):
 
     # -- set-up and main loop: allocates
     def bounds(self, p):
-        # of the tilt, and 0.25 rad of the heading
-        ramp_q8 = fixmath.ratio(p["ramp_tilt"] * 256, MILLION)
-        tilt = fixmath.ratio((1 << 31) * 256 * 14143, (ramp_q8 + 512) * 20000)
-        return p["bias_limit_dps"], tilt + (1 << 29)
+        # of tilt and heading: a half angle of 1/4 rad each
+        return p["bias_limit_dps"], 929887697
 
     def set_up(self, p, given):
         s, lsb = self.state, self.accel_lsb_per_g
-        s[_LITE] = int(self.LITE)
         whole, counts, ratio = self.blocks, self.gyro_counts, fixmath.ratio
+
+        def pairs(millionths, bits=0):
+            return whole(millionths, bits + 4) + 16 >> 5
+
         num, den = self.rate
         scale, per = self.gyro_scale
-        gain = (s[_G] << 15) + s[_GR]
-        t = den << s[_BLOCK]  # a block lasts t / num s
+        t = den << s[_BLOCK]  # a block lasts t / num s, and two of them
+        two = 2 * t
+        s[_TWO_MASK] = (2 << s[_BLOCK]) - 1
+        pi_num, pi_den = fixmath.PI_NUM, fixmath.PI_DEN
         if counts(p["field_dps"], 1) > 4000:
             raise ValueError("gyro_scale is %d/%d, too fine for field_dps" % self.gyro_scale)
-        # levelling
-        s[_RAMP] = ramp_q8 = ratio(p["ramp_tilt"] * 256, MILLION)
-        s[_K_END], s[_K_END_SHIFT] = fine_mantissa(den * MILLION, num * p["tau_tilt"], 15)
-        s[_N_RAMP] = -(-(p["tau_tilt"] * num * 256 // (MILLION * den) - 512) // ramp_q8)
-        s[_N_LATE] = ratio(p["bias_after"] * num, MILLION * den)
+        s[_PACE] = max(1, -(-_PARTS >> s[_BLOCK]))  # parts in a step: all within a block
         s[_OUTAGE] = max(1, ratio(p["outage"] * num, MILLION * den))
-        s[_N_END] = max(s[_N_RAMP], s[_N_LATE] + 1)
+        # a gyro at full scale may have missed as much again: in units of 2.5 rad, Q15
+        s[_CLIP] = max(
+            1, ratio((per * 32768 * pi_num * den << 15) * 2, 180 * 5 * scale * pi_den * num)
+        )
+        # levelling
+        s[_HELD_K] = ratio(two * MILLION << 15, 2 * p["tau_start"] * num + two * MILLION)
+        s[_SF_K] = ratio(two << 16, num + 2 * two)
+        s[_LEAN_G] = ratio(p["lost_g"] * lsb, 4 * MILLION) ** 2
+        s[_LEAN_AFTER] = pairs(2 * MILLION)
+        s[_RAMP] = ratio(p["ramp_tilt"] * 256, MILLION)
+
+        def steps(millionths):
+            return ratio(millionths * num, MILLION * den)
+
+        s[_N_LATE] = steps(p["bias_after"])
+        s[_N_FULL] = max(s[_N_LATE] + 1, steps(p["bias_full"]))
+        s[_SOON] = steps(300000)
+        for name, at in (("tau_start", _K_START), ("tau_fast", _K_MOST), ("tau_slow", _K_LEAST)):
+            s[at] = min(524287, max(1, ratio(t * MILLION << 20, p[name] * num)))
+        s[_N_END] = max(s[_N_FULL], steps(p["tau_slow"] * MILLION // p["ramp_tilt"])) + 1
+        # of 256 times the root of a quarter of the counts of 100 deg/s
+        root = fixmath.isqrt(ratio(25 * scale << 16, per))
+        s[_K_TURN] = ratio(t * MILLION << 30, p["tau_turning"] * num * root)
         while lsb << s[_NORM] < 1 << 14:
             s[_NORM] += 1
         g1 = lsb << s[_NORM]
         s[_G1] = lsb
         s[_LI] = ratio(1 << 29, g1)
-        s[_OM_GAIN] = ratio(10 << 24, 3 * g1)
+        s[_OM_GAIN] = ratio(MILLION << 24, p["accel_doubt_g"] * g1)
         # rest
+        s[_REST_K] = ratio(two << 17, num + 4 * two)
+        s[_REST_AFTER] = max(1, pairs(p["rest_after"]))
         s[_REST_MOST] = counts(p["bias_limit_dps"], 4096)
         s[_REST_OFF] = counts(p["rest_dps"], 4096)
+        s[_JUMP] = counts(MILLION, 4096)
         s[_UPSET] = ratio(p["upset_g"] * lsb, 4 * MILLION) ** 2
-        # bias
+        s[_WAIT_MOST] = max(1, pairs(p["rest_wait"]))
+        s[_WAIT_FIELD] = pairs(60 * MILLION)
+        s[_WAIT_SURE] = pairs(30 * MILLION)
+        s[_WAIT_MOVED] = ratio(3 * lsb, 400) ** 2
+        s[_GYRO] = ratio(per * two * pi_num << 28, 180 * scale * num * pi_den)
+        # bias: its unit is bias_start 2**0.5
+        unit = ratio(p["bias_start_dps"] * 141421356, 100000000)  # 1e-6 deg/s
         s[_B_SHIFT] = 20
-        while counts(p["bias_limit_dps"], 1 << s[_B_SHIFT]) >= 1 << 30:
+        while counts(max(p["bias_limit_dps"], 4 * unit), 1 << s[_B_SHIFT]) >= 1 << 29:
             s[_B_SHIFT] -= 1
         s[_B_MAX] = counts(p["bias_limit_dps"], 1 << s[_B_SHIFT])
-        s[_CC], s[_CC_SHIFT] = fine_mantissa(1 << 27, gain, 14)
-        s[_TURN_MAX] = gain >> 3
-        s[_INFO_KNOWN] = ratio(20 * num << 14, t)
-        s[_INFO_LEAST] = ratio(num << 14, t)
-        s[_INFO_DECAY] = ratio(t << 22, 150 * num)
-        s[_RATE_T] = ratio(num << 4, t)
-        # field
-        s[_REJECTED] = s[_REJECT_FOR] = whole(p["reject_for"])
-        s[_TOL] = ratio(p["field_tolerance"] ** 2 << 15, MILLION**2)
-        s[_SMOOTH] = whole(50000, 10)
-        s[_REF] = whole(p["field_tau"], 10)
-        s[_FIELD_AFTER] = max(1, whole(p["field_after"]))
-        s[_FIELD_FIRST] = whole(p["field_first"])
-        s[_FIELD_NEW] = whole(p["field_new"])
-        s[_TURNING_MIN] = counts(p["field_dps"], 4) ** 2
-        s[_AGREE] = ratio(p["field_agree"] << 28, MILLION)
-        # heading
-        s[_FAR_MIN] = ratio(p["restart_rad"] << 28, MILLION)
-        s[_RESTART_AFTER] = whole(p["restart_after"])
-        s[_HRAMP] = ratio(p["ramp_heading"] * 256, MILLION)
-        s[_HK] = ratio(t * MILLION << 22, p["tau_heading"] * num)
-        s[_HK_DOUBT] = ratio(t * MILLION << 22, p["tau_doubt"] * num)
-        s[_LIMIT_AFTER] = ratio(10 * num, t)
-        s[_WEIGHT] = 2 if s[_LITE] else 0
-        rad = fixmath.PI_NUM * t  # of a deg/s in a block: rad / (180 PI_DEN num)
-        s[_PUSH_MAX] = ratio(3 * rad << 28, 180 * fixmath.PI_DEN * num)
-        # with the 8 bits of the split
-        s[_HC], s[_HC_SHIFT] = fine_mantissa(180 * fixmath.PI_DEN * num * scale, rad * per << 8, 14)
-        s[_DOUBT_RATE] = ratio(
-            p["bias_limit_dps"] * rad << 20, 180 * MILLION * fixmath.PI_DEN * num
+        s[_B_UNIT] = counts(unit, 1 << s[_B_SHIFT] - 13)
+        s[_B_INVERSE] = ratio(MILLION * per << 20, unit * scale)
+        s[_CC] = ratio(180 * pi_den * MILLION * num << 7, unit * t * pi_num)
+        s[_GROW] = ratio(unit * two * pi_num << 21, 900 * MILLION * num * pi_den)
+        # variances: of bias in this unit squared, Q30; of measurements Q20
+        rest = ratio((p["rest_noise"] ** 2 << 30) * num, unit**2 * two)
+        s[_P_REST] = min(_HALF, rest)
+        s[_P_KNOWN] = min(_HALF, ratio((p["rest_noise"] ** 2 << 30) * 5, unit**2))
+        s[_P_VAGUE] = _HALF // 125
+        s[_P_SET] = min(_HALF, ratio(MILLION**2 << 28, unit**2))
+        s[_Q_UP], s[_Q_LEVEL] = [
+            min(65000, max(1, ratio((p[name] ** 2 << 30) * two, unit**2 * num)))
+            for name in ("bias_walk", "bias_walk_level")
+        ]
+        s[_R_REST] = max(64, rest // 3072)  # each axis in every third pair
+        s[_R_TILT] = min(1 << 24, ratio((p["tilt_noise"] ** 2 << 20) * num, 2 * unit**2 * two))
+        mag = (p["mag_noise"] ** 2 << 22) * num
+        s[_R_MAG] = min(1 << 24, ratio(mag, 25 * MILLION**2 * two))
+        s[_Q_HEADING] = max(1, ratio(36 * two << 32, 25 * 100000000 * num))
+        rad = 4 * per * p["scale_error"] * pi_num  # RATE is in (4 counts)**2
+        s[_Q_SCALE], shift = fine_mantissa(
+            rad**2 * two << 32, 25 * (180 * scale * pi_den * MILLION) ** 2 * num, 14
         )
+        s[_Q_SCALE_SHIFT] = max(0, shift - 14)
+        # field
+        s[_TOL] = ratio(p["field_tolerance"] ** 2 << 15, MILLION**2)
+        s[_SAME] = ratio(64 << 15, 10000)
+        s[_SMOOTH] = pairs(50000, 10)
+        s[_REF] = pairs(p["field_tau"], 10)
+        s[_FIELD_AFTER] = max(1, pairs(p["field_after"]))
+        s[_FIELD_FIRST] = pairs(p["field_first"])
+        s[_FIELD_NEW] = pairs(p["field_new"])
+        s[_FOR_MOST] = pairs(60 * MILLION)
+        s[_NEED] = pairs(5 * MILLION)
+        s[_NEED_MOST] = pairs(125 * MILLION)
+        s[_BACK_AFTER] = pairs(3 * MILLION)
+        s[_STEADY_MOST] = max(1, pairs(MILLION))
+        s[_STILL_K] = ratio(two << 15, 5 * num + two)
+        s[_TURNING_MIN] = max(1, counts(p["field_dps"], 1) ** 2 >> 4)
+        s[_GATE] = ratio(p["field_gate"] << 28, MILLION)
+        s[_RESTART_AFTER] = pairs(2 * p["restart_after"])
 
     def start_at(self, q, known=0):
         EarthFilter.start_at(self, q)
         s = self.state
-        for first, n in ((_S, 5), (_X, 16), (_C, 3), (_U, 3)):
+        for first, n in (
+            (_S, 3),
+            (_OFF, 2),
+            (_SF, 2),
+            (_X, 12),
+            (_DX, 4),
+            (_FS, 3),
+            (_C, 2),
+            (_LAST, 3),
+            (_GG, 3),
+        ):
             for i in range(n):
                 s[first + i] = 0
-        for i in (_N, _LATE, _HN, _LOST, _PUSH, _ZK, _GAP):
+        for i in (
+            _AGAIN,
+            _N,
+            _D,
+            _LEAN,
+            _GAP,
+            _WAIT,
+            _WAIT_TURN,
+            _STILL_SET,
+            _LOST,
+            _OWN,
+            _FULL,
+            _CLIPPED,
+        ):
             s[i] = 0
+        s[_PART] = _PARTS
+        s[_LEVEL] = s[_LEVEL_MASK] = s[_REGRESS] = 0
+        s[_PHASE] = 1  # the first blocks are whole ones
         s[_S + 2] = self.accel_lsb_per_g << 14
         s[_OM] = 32768
-        s[_DOUBT] = _PI28 if s[_NINE] else 0
+        s[_K_PACE] = s[_K_START]
+        s[_P] = _OPEN if s[_NINE] else 1 << 16
+        for i in range(1, 4):
+            s[_P + i] = s[_P + 4 * i] = 0
+        s[_DOUBT] = fixmath.isqrt(s[_P]) * 20480
 
     def bias_is_new(self, known_s):
         s = self.state
-        for i in range(3):
-            s[_INFO + i] = s[_INFO_LEAST]
-            s[_II + i] = 1 << 20
+        for i in range(1, 16):
+            s[_P + i] = 0
+        variance = _HALF
+        if known_s > 0:  # 0.5 deg/s / known_s**0.5
+            variance = fixmath.ratio(s[_P_SET] * MILLION, fixmath.quantise(known_s, "known_s"))
+            variance = min(_HALF, max(64, variance))
+        for i in (5, 10, 15):
+            s[_P + i] = variance
+        s[_WAIT] = 0
 
     @property
     def bias_unit(self):
@@ -263,16 +400,21 @@ class Inertial9(EarthFilter):
     def mag_accepted(self):
         """True while the magnetometer corrects the heading; False if its field is rejected or absent."""
         s = self.state
-        return s[_WEIGHT] == 2 and s[_SINCE] < 16 and s[_HN] > 0
+        return s[_WEIGHT] == 2 and s[_SINCE] < 16 and s[_N] > 0 and bool(s[_NINE])
 
     @property
     def heading_uncertainty_mdeg(self):
-        """Approximate error of the heading in millidegrees: 0..180000.
+        """Standard deviation of the heading's error in millidegrees, 0..99000, as far as the filter can know it.
 
-        It is the average difference from the magnetometer's heading while that is accepted. Otherwise it grows with the
-        uncertainty of the vertical axis's bias. Six axes: since the start.
+        It grows with what is not known of the vertical bias, with turning, and with a gyro at full scale; the
+        magnetometer takes it back. Six axes: since the start.
         """
         return (self.state[_DOUBT] >> 15) * 7162 >> 10
+
+    @property
+    def clipped(self):
+        """Samples so far with a gyro axis at full scale: what it turned by meanwhile is not known."""
+        return self.state[_CLIPS]
 
     @property
     def tilt_confidence(self):
@@ -286,7 +428,8 @@ class Inertial9(EarthFilter):
 
         With bit 0 of flags (word 10) clear (no fresh sample) the filter turns with the last gyro words, without
         feedback, and all estimates stay unchanged. Bit 1: the magnetometer's words are fresh; its rate may be as low as
-        a tenth of the steps'. Bits 2 and 3 (full scale) change nothing: leaving such samples out would be worse.
+        a tenth of the steps'. Bit 2 (accelerometer at full scale) changes nothing: leaving such samples out would be
+        worse. Bit 3 (gyro at full scale) makes the heading doubtful; ten in a row restart the tilt's ramp.
         """
         state = self.state
         s = ptr32(state)
@@ -308,86 +451,110 @@ class Inertial9(EarthFilter):
         w = (s[_OR + 2] << k >> k) + o * fine + s[_WR + 2]
         fresh = c[10] & 1
         if fresh:
-            s[_GS] = (s[_GS] << k >> k) + n
-            s[_GS + 1] = (s[_GS + 1] << k >> k) + m
-            s[_GS + 2] = (s[_GS + 2] << k >> k) + o
+            s[_GS] = s[_GS] + n
+            s[_GS + 1] = s[_GS + 1] + m
+            s[_GS + 2] = s[_GS + 2] + o
+        s[_WR] = u & 32767
+        s[_WR + 1] = v & 32767
+        s[_WR + 2] = w & 32767
+        # coning: + last x this / 6 of the half angles (a 12th of the angles), J. W. Jordan, NASA TN D-5384, 1969
+        m = x + 32768 >> 16
+        n = y + 32768 >> 16
+        o = z + 32768 >> 16
+        i = s[_LAST] << k >> k
+        gain = s[_LAST + 1] << k >> k
+        fine = s[_LAST + 2] << k >> k
+        s[_LAST] = m
+        s[_LAST + 1] = n
+        s[_LAST + 2] = o
+        r = gain * o - fine * n
+        x += (u >> 15) + (r >> 8) * 85
+        r = fine * m - i * o
+        y += (v >> 15) + (r >> 8) * 85
+        r = i * n - gain * m
+        z += (w >> 15) + (r >> 8) * 85
+        if fresh and s[_TURN] | s[_TURN + 1] | s[_TURN + 2]:
             # + R' TURN, the last correction, from the earth into the body
             i = 0
-            r = _R
             while i < 3:
                 n = s[_TURN + i] << k >> k
                 m = (n + 16384) >> 15
                 n -= m << 15
-                o = s[r] << k >> k
-                x += o * m + (o * n + 16384 >> 15)
-                o = s[r + 1] << k >> k
-                y += o * m + (o * n + 16384 >> 15)
-                o = s[r + 2] << k >> k
-                z += o * m + (o * n + 16384 >> 15)
-                r += 3
+                o = _R + 3 * i
+                gain = s[o] << k >> k
+                x += gain * m + (gain * n + 16384 >> 15)
+                gain = s[o + 1] << k >> k
+                y += gain * m + (gain * n + 16384 >> 15)
+                gain = s[o + 2] << k >> k
+                z += gain * m + (gain * n + 16384 >> 15)
+                s[_TURN + i] = 0
                 i += 1
-            s[_TURN + 2] = 0  # the others are of each step
-        s[_WR] = u & 32767
-        s[_W] = x + (u >> 15)
-        s[_WR + 1] = v & 32767
-        s[_W + 1] = y + (v >> 15)
-        s[_WR + 2] = w & 32767
-        s[_W + 2] = z + (w >> 15)
+        s[_W] = x
+        s[_W + 1] = y
+        s[_W + 2] = z
         turn(state)
         if fresh == 0:
             if s[_GAP] < s[_OUTAGE]:
                 s[_GAP] += 1
-        else:
-            if s[_GAP]:
-                if s[_GAP] == s[_OUTAGE]:  # too long: the attitude is unknown
-                    s[_N] = 0
-                    s[_HN] = 0
-                s[_GAP] = 0
-            if s[_N] < s[_N_END]:
-                ramp(state)
-            to_earth(state, counts)
+            return
+        if s[_GAP] | s[_FULL] | c[10] & 8:
+            if s[_GAP] == s[_OUTAGE]:  # too long: the attitude is unknown
+                s[_AGAIN] = 1
+                open_heading(state, _OPEN)
+            s[_GAP] = 0
+            if c[10] & 8:
+                if s[_CLIPS] < 0x3FFFFFFF:
+                    s[_CLIPS] += 1
+                s[_CLIPPED] += 1
+                if s[_FULL] < 10:
+                    s[_FULL] += 1
+            else:
+                if s[_FULL] == 10:
+                    s[_AGAIN] = 1
+                s[_FULL] = 0
+        to_earth(state, counts)
+        i = s[_PHASE]
+        s[_PHASE] = (i + 1) & s[_TWO_MASK]
+        part = s[_PART]
+        if i == 0:
+            part = 0
+        if i & s[_LEVEL_MASK] == 0:
+            close(state, counts)
             level(state)
-            i = s[_PHASE]
-            s[_PHASE] = (i + 1) & s[_BLOCK_MASK]
-            if i == 0:
-                # input of the rest detector: sample and block mean, less the bias that was set
-                fine = 12 - s[_BLOCK]
-                i = 0
-                while i < 3:
-                    n = ((c[i] & 0xFFFF) ^ 0x8000) - 0x8000
-                    s[_IN + i] = n << 12
-                    m = (s[_BASE + i] << k >> k) << 4
-                    n = ((c[3 + i] & 0xFFFF) ^ 0x8000) - 0x8000
-                    s[_SEEN + i] = (n << 12) - m
-                    s[_IN + 3 + i] = ((s[_GS + i] << k >> k) << fine) - m
-                    s[_GS + i] = 0
-                    i += 1
+            s[_REGRESS] = 1
+            if s[_LEVEL] == 0:
+                regress(state)
+        elif s[_REGRESS]:
+            s[_REGRESS] = 0
+            regress(state)
+        n = s[_PACE]
+        while n and part < _PARTS:
+            if part == 1:
+                pace(state)
                 low_pass(state, _SEEN)
                 detect_rest(state)
-            elif i == 1:
-                regress(state)
-            elif i == 2:
-                compass(state, _MS, _PI28)
-            elif i == 3:
-                if s[_J] and s[_LITE] == 0:
-                    smooth_field(state, counts)
+            elif part == 2:
+                if s[_NINE]:
+                    compass(state, _MS, _PI28)
+                else:
+                    part = 3
+            elif part == 3:
+                if s[_J]:
+                    smooth_field(state)
                     judge_field(state)
-                if s[_BLOCK] == 2:  # a block of four steps: the rest of it as well
-                    steer(state)
-                    learn(state)
-            elif i == 4:
-                steer(state)
-            elif i == 5:
-                learn(state)
-
-
-class Inertial9Lite(Inertial9):
-    """Inertial9 that accepts every magnetic field, and never restarts its heading."""
-
-    NAME = "inertial9-lite"
-    LITE = True
-
-    update = Inertial9.update  # see attitude.py
+            elif part == 4:
+                grow(state)
+            elif part == 5:
+                if int(measure_heading(state)):
+                    take(state)
+            elif part == 6:
+                if int(measure_bias(state)):
+                    take(state)
+            elif part == 7:
+                apply(state)
+            part += 1
+            n -= 1
+        s[_PART] = part
 
 
 class Inertial6(Inertial9):

@@ -14,7 +14,7 @@ from pathlib import Path
 from upright_host import paths, runtimes, tracing
 
 SCRIPT = paths.SIMULATOR / "bench" / "filter_cost.py"
-TRACED = 16  # updates; the magnetometer is fresh in two of them
+TRACED = 32  # updates, the longest round of any filter; the magnetometer is fresh in four of them
 ALLOCATIONS = 1000  # updates
 TRACE_HEAP = "1M"
 # those with a board's word size first: a float, say, takes other room on 64 bits
@@ -137,7 +137,9 @@ def _say(runtime, *arguments) -> str:
 
 
 def _instructions(name: str, folder: Path) -> float:
-    """Thumb-2 instructions of an update, what surrounds it taken off."""
+    """Thumb-2 instructions of an update in the steady state, what surrounds it taken off."""
+    state = folder / f"{name}.state"
+    _say("arm", "warm", name, state)
     start, _ = runtimes.interpreter("arm")
     argv = [
         *start,
@@ -147,6 +149,7 @@ def _instructions(name: str, folder: Path) -> float:
         "trace",
         name,
         str(TRACED),
+        state,
     ]
     found = tracing.per_step(tracing.marks(argv, os.environ | {"MICROPYPATH": str(folder)}))
     if not found.get("update", 0) > found.get("empty", 0):

@@ -92,7 +92,7 @@ O            3  Q31  minus the bias as a half angle per step
 OR           3  Q46  its last bits, -32767..32767
 TURN         3  Q31  correction that the next step takes up, earth frame, half angle
 R            9  Q15  rotation matrix; its rows are north, west, up in the body
-FORCE        3  Q15  specific force of this sample in the earth frame, counts
+FS           3  Q9   specific force in the earth frame, counts, summed over the block
 BASE         3  Q8   gyro bias that was set, counts
 O_BASE       3  Q31  O of BASE alone
 OR_BASE      3  Q46  its last bits
@@ -123,84 +123,134 @@ REST_MOST    1  Q12  most that is taken for a bias, counts
 """
 
 INERTIAL = """
+TWO_MASK     1  -    steps of two blocks less 1
+LEVEL        1  -    log2 of the steps of a levelling: 0 at the start, BLOCK in the end
+LEVEL_MASK   1  -    steps of it less 1
+REGRESS      1  -    1: the regressors take their step next
+PART         1  -    part of the work of two blocks that comes next
+PACE         1  -    parts in one step
+GG           3  -    gyro counts summed over two blocks
+FULL         1  -    samples in a row with a gyro axis at full scale, no more than FULL_MOST
+CLIPS        1  -    samples with one, no more than 2**30 - 1
+CLIPPED      1  -    samples with one in this block
+CLIP         1  Q15  what one adds to the doubt of the heading, units of 2.5 rad
+OUTAGE       1  -    steps without one that restart the ramp
 SEEN         3  Q12  the gyro of one sample, less BASE
+H            3  Q14  specific force of the block in the earth frame, counts
+RATE         1  -    squared turn rate of the block, (4 counts)**2
+HELD         1  -    the same: follows up at once and down slowly
+HELD_K       1  Q15  gain down
 S            3  Q14  low-passed specific force in the earth frame, counts
-OFF          2  Q14  its last sample less the low-pass, horizontal, counts
-K            1  -    tilt gain times dt = K / 2**K_SHIFT, K < 2**15
+OFF          2  Q14  the block's force less the low-pass, horizontal, counts
+SF           2  Q14  the force low-passed quickly, horizontal, counts
+SF_K         1  Q15  gain of it
+LEAN_G       1  -    |SF| beyond which the tilt is lost: (4 counts)**2
+LEAN         1  -    blocks with more
+LEAN_AFTER   1  -    blocks
+K            1  -    tilt gain of this levelling = K / 2**K_SHIFT, K < 2**15
 K_SHIFT      1  -
 KC           1  -    the same for S (normalised) to half angle
 KC_SHIFT     1  -
-N            1  -    fresh steps since the start of the ramp, no more than N_END
-N_RAMP       1  -    steps of the ramp
+AGAIN        1  -    1: the ramp starts anew
+N            1  -    steps since the start of the ramp, no more than N_END
 N_LATE       1  -    steps until the bias is estimated in motion
+N_FULL       1  -    steps until it is at full weight
 N_END        1  -    steps after which the start is over
-LATE         1  -    1: the bias is estimated in motion
 RAMP         1  Q8   ramp of the tilt
-K_END        1  -    K after the ramp
-K_END_SHIFT  1  -
+K_PACE       1  Q20  tilt gain of a block after the start
+K_START      1  Q20  tilt gain of a block while little is known of the bias ...
+K_LEAST      1  Q20  ... and its bounds afterwards
+K_MOST       1  Q20
+K_TURN       1  -    tilt gain for the fourth root of HELD: K_TURN / 2**18
 NORM         1  -    shift that brings 1 g to 2**14..2**15 counts
 G1           1  -    1 g in counts
 LI           1  Q29  1 / (1 g, normalised)
-OM_GAIN      1  Q24  1 / (0.3 g, normalised)
+OM_GAIN      1  Q24  1 / (accel_doubt, normalised)
 X            6  Q24  regressors north and west: inner low-pass
 Y            6  Q24  outer low-pass
-Z            3  Q24  regressor up
-D            1  Q15  square of the horizontal deviation / (0.3 g)**2
+D            1  Q15  square of the horizontal deviation / accel_doubt**2
 OM           1  Q15  tilt confidence 1 / (1 + D)
-U            3  Q15  what the block tells about the bias, counts
-INFO         3  Q14  information about it, blocks
-II           3  Q20  1 / information in seconds
-INFO_LEAST   1  Q14  first information, blocks
-INFO_KNOWN   1  Q14  with more the bias is well known, blocks
-INFO_DECAY   1  Q22  1 / blocks of 150 s
-RATE_T       1  Q4   blocks a second
 REST_OFF     1  Q12  most that a known bias may be off, counts
-UPSET        1  -    tilt at rest that restarts the ramps: (counts / 4)**2
+UPSET        1  -    tilt at rest that restarts the ramp: (counts / 4)**2
+JUMP         1  Q12  a bias found at rest that restarts the ramp, counts
+SOON         1  -    steps after a restart in which no other follows
+WAIT         1  -    blocks for which a rest has contradicted the bias
+WAIT_MOST    1  -    blocks
+WAIT_FIELD   1  -    blocks that the magnetometer is waited for
+WAIT_SURE    1  -    blocks after which a slow turn is decided, too
+WAIT_E       1  Q28  the heading error at their start, rad
+WAIT_TURN    1  Q28  corrections of the heading since, rad
+WAIT_A       3  Q12  accelerometer at their start, counts
+WAIT_MOVED   1  -    how far it may be from there: counts**2 / 16
+GYRO         1  Q28  the angle of a count in one block, rad
 B_SHIFT      1  -    B is in counts, Q(B_SHIFT)
 B_MAX        1  -    its bound
-C            3  Q12  correction (north, west; up) in counts
-CC           1  -    half angle (Q31) to counts (Q12): CC / 2**CC_SHIFT
-CC_SHIFT     1  -
-TURN_MAX     1  Q31  4096 counts as a half angle
-HAVE         1  -    1: field and candidate are set; 2: reference, too
-F            2  Q13  smoothed field, counts
-FR           2  Q13  reference; F, FR and FC stand together
+B_UNIT       1  -    the unit of P's biases in B's, / 2**13
+B_INVERSE    1  -    2**20 counts / this unit
+P            16 Q30  covariance of heading (2.5 rad) and bias (bias_start * 2**0.5), 4 x 4
+DX           4  Q27  their correction in this block
+INNOVATION   1  Q27  what is measured of a sum of errors ROW . (heading, bias), less what DX says ...
+NOISE        1  Q20  ... its variance ...
+Z            4  Q30  ... P ROW ...
+TOTAL        1  Q30  ... and ROW P ROW
+P_REST       1  Q30  variance of a bias of 1 block of rest
+P_KNOWN      1  Q30  variance of a bias that is known ...
+P_VAGUE      1  Q30  ... and of one of which little is known
+P_SET        1  Q30  variance of a bias that was set with known_s = 1
+Q_HEADING    1  Q30  variance that a block adds to the heading ...
+Q_SCALE      1  -    ... and for RATE: Q_SCALE / 2**Q_SCALE_SHIFT
+Q_SCALE_SHIFT 1 -
+Q_LEVEL      1  Q30  variance that a block adds to a horizontal bias ...
+Q_UP         1  Q30  ... and to a vertical one
+GROW         1  Q20  heading that a unit of bias makes in a block
+R_TILT       1  Q20  variance of a tilt correction as a bias
+R_REST       1  Q20  variance of the gyro at rest
+R_MAG        1  Q20  variance of a heading
+SHARE        1  Q15  how much of what the measurement says of the bias is believed
+AXIS         1  -    of the gyro that was measured last, at rest
+SIDE         1  -    which tilt correction comes next: 0 north, 1 west
+CC           1  -    TURN to INNOVATION: CC / 2**10
+C            2  Q31  TURN of the last levelling, north and west
+HAVE         1  -    1: field and candidate are set; 2: reference, too; 4: the one before, too
+F            2  Q13  smoothed field, counts, horizontal and vertical
+FR           2  Q13  reference; F, FR, FO and FC stand together
+FO           2  Q13  the reference before this one
 FC           2  Q13  candidate
 NEAR         1  -    blocks near the reference, no more than FIELD_AFTER
-CAND         1  -    blocks near the candidate
-REJECTED     1  -    blocks
-WEIGHT       1  -    of the heading, in halves: 2 accepted, 1 after a long rejection, 0
+FOR          1  -    blocks for which the reference was seen while turning
+FOR_MOST     1  -    most of it
+FO_FOR       1  -    the same of the reference before
+CAND         1  -    the same of the candidate
+BACK         1  -    blocks near the reference before
+BACK_AFTER   1  -    blocks
+CAND_E       1  Q28  heading error in the candidate's field, rad
+STILL_E      1  Q28  slow mean of the heading error at rest, rad
+STILL_SET    1  -    1: it is set
+STILL_K      1  Q15  its gain
+STEADY       1  -    blocks with the field near to the reference, no more than STEADY_MOST
+STEADY_MOST  1  -    blocks
+OWN          1  -    1: the heading error is the attitude's own, not another field's
+LOST         1  -    half blocks of such an error
+RESTART_AFTER 1 -    half blocks
+WEIGHT       1  -    2: the heading is taken up
 TOL          1  Q15  tolerance squared
+SAME         1  Q15  the same for a field that has not changed
 SMOOTH       1  Q10  blocks of 0.05 s
 REF          1  Q10  blocks of the reference's time constant
 FIELD_AFTER  1  -    blocks
 FIELD_FIRST  1  -    blocks
 FIELD_NEW    1  -    blocks
-REJECT_FOR   1  -    blocks
-TURNING_MIN  1  Q4   counts**2
-AGREE        1  Q28  rad
-HN           1  -    blocks since the start of the heading's ramp
-LOST         1  -    blocks of large heading error
-FAR_MIN      1  Q28  rad
-RESTART_AFTER 1 -    blocks
-HRAMP        1  Q8   ramp of the heading
-HK           1  Q22  heading gain of a block
-HK_DOUBT     1  Q22  the same where 1 / information is 1
-LIMIT_AFTER  1  -    blocks
-PUSH         1  Q28  heading correction of one block, rad
-ZK           1  Q22  gain of it
-PUSH_MAX     1  Q28  bound of it for the bias, rad
-HC           1  -    PUSH to counts, Q12: HC / 2**(HC_SHIFT + 8)
-HC_SHIFT     1  -
+NEED         1  -    blocks of 5 s
+NEED_MOST    1  -    blocks
+TURNING_MIN  1  -    squared turn rate, (4 counts)**2
+GATE         1  Q28  heading error that is believed, beside the doubt, rad
+GOOD         1  -    1: the field is the reference's, and its heading is believed
 DOUBT        1  Q28  heading uncertainty, rad
-DOUBT_RATE   1  Q20  its growth in a block where 1 / information is 1, rad
-LITE         1  -    1: no field rejection, no restart of the heading
 GAP          1  -    steps since the last fresh sample
-OUTAGE       1  -    steps without one that restart the ramps
+LAST         3  Q15  half angle of the step before, without correction, rad
 """
 
 QUATERNION_KALMAN = """
-HS           3  Q9   specific force in the earth frame, summed over the block, counts
 AS           3  -    accelerometer counts, summed
 STAGE        1  -    the next piece of the block's work, 0..8
 PER          1  -    pieces in a step

@@ -1,7 +1,8 @@
 # What one filter of the registry costs, and how soon it finds up: for `upright compare`. Runs on every runtime.
 # The time it takes is no matter here. Arguments: MODE FILTER, then
 #
-#   trace  N                  says where N updates begin and end, for whoever counts the instructions in between
+#   warm   FILE               writes the state after WARM updates, when its start is over
+#   trace  N FILE             goes on from there: says where N updates begin and end, for whoever counts instructions
 #   alloc  N                  prints the bytes that N updates allocate; nothing where the port does not tell
 #   settle NUM/DEN NUM/DEN G  rate in Hz, LSB per deg/s, LSB per g: prints how many updates pass until the tilt stays
 #                             within 2 deg of the truth, "never" when it does not do so in 60 s
@@ -13,7 +14,7 @@ from array import array
 from upright import filters
 
 RATE = (200, 1)
-WARM = 16  # updates before anything is counted
+WARM = 2000  # updates before anything is counted: 10 s
 WRONG = (70711, 50000, 50000, 0)  # 90 deg about the horizontal axis between x and y
 SECONDS = 60
 NEAR = 3.0458649e-4  # sin(2 deg / 2)**2
@@ -58,17 +59,28 @@ def loop_update(filter, n):
         i += 1
 
 
-def started(name):
-    filter = filters.make(name, RATE, Scales((82, 5), 4096), {})
+def made(name):
+    return filters.make(name, RATE, Scales((82, 5), 4096), {})
+
+
+def warmed(name):
+    filter = made(name)
     filter.seed(ROWS[0])
     loop_update(filter, WARM)
-    gc.collect()
-    gc.disable()
     return filter
 
 
-def trace(name, n):
-    filter = started(name)
+def warm(name, file):
+    with open(file, "wb") as f:
+        f.write(warmed(name).state)
+
+
+def trace(name, n, file):
+    filter = made(name)
+    with open(file, "rb") as f:
+        f.readinto(filter.state)
+    gc.collect()
+    gc.disable()
     for part, loop in (("empty", loop_empty), ("update", loop_update)):
         for steps in (0, int(n)):
             # each in one write: between two there would be lines of the trace
@@ -80,7 +92,9 @@ def trace(name, n):
 def alloc(name, n):
     if not hasattr(gc, "mem_alloc"):
         return
-    filter = started(name)
+    filter = warmed(name)
+    gc.collect()
+    gc.disable()
     before = gc.mem_alloc()
     loop_update(filter, int(n))
     print(gc.mem_alloc() - before)
@@ -103,5 +117,5 @@ def settle(name, rate, gyro_scale, accel_lsb_per_g):
     print(far + 1 if far < n - 1 else "never")
 
 
-MODES = {"trace": trace, "alloc": alloc, "settle": settle}
+MODES = {"warm": warm, "trace": trace, "alloc": alloc, "settle": settle}
 MODES[sys.argv[1]](*sys.argv[2:])
