@@ -1,72 +1,151 @@
-"""The inertial-frame Mahony filter in double-precision floats: what lib/upright/inertial.py is measured against.
+"""The inertial filter in double-precision floats: what lib/upright/inertial.py is measured against.
 
-Plain Python without numpy; runs on CPython. Same schedule and same order of work as the integer filter (what runs every
-step, what every BLOCK steps), but physical units, true roots and angles, and no rounding. Yes/no decisions are taken
-here, or copied from the integer run (`update(counts, decisions)`), so that a comparison measures arithmetic alone.
+Plain Python without numpy; runs on CPython. Same schedule and same order of work as the integer filter, but physical
+units, true roots and angles, and no rounding. Yes/no decisions are taken here, or copied from the integer run
+(`update(counts, decisions)`), so that a comparison measures arithmetic alone.
 """
+
+# The model. dt: one step; T: one block of 2**n steps, 44 to 88 ms (4 steps at least); T2: two blocks. q turns the body
+# into the earth; R: its matrix, whose rows are north, west and up as the body sees them; g: acceleration of gravity.
+#
+# Every step, w the gyro's rate less the bias that was set and the learnt one b:
+#     d = w dt;  q turns by d + d_before x d / 12 + R' turn
+# The product is the coning term. `turn` is the last correction (earth frame): the next fresh step takes it up.
+#
+# Levelling, every block. h: mean of the specific force in the earth frame, in g; s: h low-passed.
+#     s += 2 k (h - s);  turn_north = k s_west;  turn_west = -k s_north;  k = T / tau
+# k acts twice, on s and on the attitude: a second-order low-pass that is critically damped. Each of s_north and s_west
+# counts as 1 g at most; upside down, (s_north, s_west) counts as if it were 1.4 g long.
+#     tau = tau_turning (100 deg/s / |w|)**(1/2), between tau_fast and tau_slow
+# |w| is held: it follows up at once, and down slowly. tau = tau_start while a bias is known worse than to bias_start /
+# 125**(1/2). After a (re)start, N blocks ago, k is at least 1 / (ramp_tilt N + 1), and never more than 1/2.
+# The tilt is lost, and starts again, when |h| (horizontal, low-passed over 0.5 s) is above lost_g for 2 s.
+#
+# What follows is done every two blocks.
+#
+# Rest: gyro and accelerometer are near their two-pole low-passes for rest_after.
+#
+# The error is estimated by a Kalman filter of four states, x = (heading, bias) with covariance P. The gyro turns the
+# heading away by what is wrong with the bias about the vertical (u = third row of R):
+#     heading' = -u . bias + noise of (0.0006 rad)**2 + (scale_error |w|)**2 a second
+#     bias'    = noise of bias_walk**2 along u, bias_walk_level**2 across it, a second
+# It is measured, each value having the variance that is given here over the seconds of its block:
+#     compass       e = atan2(-west, north) of the block's mean field: the heading, mag_noise**2
+#     tilt, moving  -(turn_north, turn_west) / T = (y_north, y_west) . bias, tilt_noise**2 (1 + D)
+#     rest          low-passed gyro - b: the bias, rest_noise**2
+# y_north and y_west are the first two rows of R, low-passed as the tilt is; D is the low-pass of |h - s|**2 /
+# accel_doubt_g**2. The compass's innovation is bounded by 0.02 rad + 0.7 doubt, doubt**2 = P(heading). Its
+# noise is split: one measurement with 4.4 times the variance corrects heading and bias, another, with what is left,
+# the heading alone. So a field that is slowly wrong teaches the bias little.
+# After two blocks b takes up the bias's part of x, `turn` about up the heading's; the tilt is never touched.
+#
+# A start, a restart of the tilt, or a gyro at full scale make P(heading) larger again, as far as 3 rad**2; what
+# contradicts the bias makes P(bias) that of the start.
+#
+# Field: the pair (horizontal, vertical) of the mean field, and e. It is believed while it is near the reference, and
+# |e| below field_gate + 1.125 doubt; at rest e stays where it was to 0.1 rad, too. Another field, or the same with
+# another heading, becomes the reference when it has stayed for long enough, counted while the body turns: field_first
+# for the first, field_new for one with the same heading, otherwise twice as long as the reference was seen, and 5 s;
+# 3 s for the reference before this one. A heading error that comes up while the field stays the same is the attitude's
+# own: after restart_after the heading starts again.
 
 import math
 
 # decisions, as lib/upright/inertial.py has them in its state
-STILL = 1  # gyro and accelerometer near their averages in this block
+STILL = 1  # gyro and accelerometer near their averages, and the gyro below the largest bias
 NEAR_REFERENCE = 2  # field near the reference
-NEAR_CANDIDATE = 4  # field near the candidate for a new reference
+NEAR_CANDIDATE = 4  # field and heading near the candidate for a new reference
 TURNING = 8  # turning quickly enough to learn a field
-FAR = 16  # heading error beyond what a good field explains
-OVER = 32  # more than 90 degrees from level (this one is taken every step)
-AGREES = 64  # heading near enough for a new reference
+CONSISTENT = 16  # heading error no larger than what the gyro explains
+OVER = 32  # more than 90 degrees from level
+NEAR_OLD = 64  # field near the reference before, and nearer than to this one
 UPSET = 128  # a tilt error at rest that cannot be
+CONTRADICTS = 256  # a rest that contradicts a known bias
+ADOPT = 512  # it is believed
+TURNED = 1024  # it is none: the body turned, or moved
+LEANS = 2048  # a horizontal force that no tilt should leave
+SAME = 4096  # field still that of the reference
+FORGET = 8192  # so little is known of the heading that any field will do
+VAGUE = 16384  # little is known of a bias
+JUMPED = 32768  # a rest ends the tilting that an unknown bias did
 
 DEFAULTS = {
-    "tau_tilt": 3.0,
-    "tau_heading": 10.0,
-    "tau_doubt": 2.0,
-    "ramp_tilt": 0.5,
-    "ramp_heading": 0.75,
-    "bias_after": 5.0,
-    "bias_limit_dps": 6.0,
+    "tau_start": 2.4,
+    "tau_fast": 3.2,
+    "tau_slow": 20.0,
+    "tau_turning": 4.4,
+    "ramp_tilt": 0.7,
+    "accel_doubt_g": 0.16,
+    "bias_after": 0.3,
+    "bias_full": 7.0,
+    "bias_limit_dps": 25.0,
+    "bias_start_dps": 4.0,
+    "bias_walk": 0.0005,
+    "bias_walk_level": 0.05,
+    "tilt_noise": 3.5,
+    "rest_noise": 0.05,
+    "mag_noise": 0.26,
+    "scale_error": 0.0034,
     "rest_gyro_dps": 2.0,
     "rest_accel_g": 0.051,
     "rest_after": 1.5,
-    "rest_dps": 0.5,
+    "rest_dps": 0.3,
+    "rest_wait": 12.0,
     "upset_g": 0.25,
-    "field_tolerance": 0.2,
+    "lost_g": 0.6,
+    "field_tolerance": 0.15,
     "field_after": 0.3,
-    "field_tau": 20.0,
+    "field_tau": 30.0,
     "field_first": 5.0,
     "field_new": 20.0,
     "field_dps": 20.0,
-    "field_agree": 0.5,
-    "reject_for": 60.0,
-    "restart_rad": 0.55,
-    "restart_after": 5.0,
+    "field_gate": 0.36,
+    "restart_after": 8.0,
     "outage": 0.5,
 }
+BLOCKS_HZ = 23
+PARTS, LEVELLING = 10, 2  # parts of the work of a block; of every other block there are but these
+TURN_MOST = 0.5  # rad a block: each part of a correction
+LEAN_TAU, LEAN_AFTER = 0.5, 2.0  # s
+FULL_MOST = 10  # samples with a gyro at full scale, after which the tilt starts again
 REST_TAU = 0.25  # s
+SOON = 0.3  # s
+JUMP_DPS = 1.0
+WAIT_FIELD, WAIT_SURE = 60.0, 30.0  # s
+WAIT_MOVED_G = 0.03
+TURN_SURE, TURN_LEAST = 0.1, 0.02  # rad
 FIELD_SMOOTH = 0.05  # s
-INFORMATION_FIRST = 1.0  # s
-INFORMATION_MOTION = 150.0  # s
-INFORMATION_KNOWN = 20.0  # s
-REST_WEIGHT = 100.0
-HEADING_WEIGHT = 0.1
-HALF_WEIGHT_G = 0.3
-HEADING_RATE_DPS = 3.0
-LIMIT = 0.16  # rad
-LIMIT_U = 1.0  # rad per unit of uncertainty
-LIMIT_AFTER = 10.0  # s
-REJECTED_WEIGHT = 0.5
+SAME_TOLERANCE = 0.08
+FOR_MOST, NEED, NEED_MOST, BACK_AFTER, STEADY_MOST = 60.0, 5.0, 125.0, 3.0, 1.0  # s
+STILL_TAU, STILL_E = 5.0, 0.1  # s, rad
+CANDIDATE_E = 0.35  # rad
+FORGOTTEN = 0.3  # rad**2
+OPEN, SIX = (
+    3.0,
+    2**-14 * 6.25,
+)  # rad**2: nothing is known of the heading; six axes: it is the start's
+WALK = 0.0006  # rad per root s
+LIMIT, LIMIT_DOUBT = 0.02, 0.6875  # rad, 1
+GATE_DOUBT = 1.125
+SPLIT = 4.4
+LEAST = 2.0**-24  # of a variance, in units of (2.5 rad)**2 or 2 bias_start**2
+NOISE_MOST, TILT_MOST = 512.0, 16.0  # of a measurement, in units of 2 bias_start**2
 
 
-def block_of(rate):
-    """Steps of a block: the power of two that takes 22 to 44 ms."""
+def block_of(rate, blocks_hz=BLOCKS_HZ):
+    """Steps of a block: the least power of two, 4 or more, with which there are fewer than blocks_hz a second."""
     block = 4
-    while rate / block >= 45:
+    while rate / block >= blocks_hz:
         block *= 2
     return block
 
 
 def clamp(v, limit):
     return limit if v > limit else -limit if v < -limit else v
+
+
+def wrap(angle):
+    return math.remainder(angle, 2 * math.pi)
 
 
 class EarthFloat:
@@ -96,151 +175,317 @@ class EarthFloat:
 
 
 class InertialFloat(EarthFloat):
-    """The float twin of inertial.Inertial9, and by axes and lite of the others there.
+    """The float twin of inertial.Inertial9, with 6 axes Inertial6.
 
-    rate in Hz (float); gyro_scale LSB per deg/s and accel_lsb_per_g as floats; axes 6 or 9; lite: no field rejection
-    and no heading restart; any of DEFAULTS.
-    q: [w, x, y, z]; b: learned bias, rad/s; rest: bool; weight: 1 field accepted, 0 or 0.5 rejected;
-    disagreed: how many decisions would have been taken otherwise here.
+    rate in Hz (float); gyro_scale LSB per deg/s and accel_lsb_per_g as floats; axes 6 or 9; any of DEFAULTS.
+    q: [w, x, y, z]; b: learned bias, rad/s; P: covariance of heading (rad) and bias (rad/s); rest: bool; weight: 1
+    heading accepted, 0 rejected; doubt: of the heading, rad; disagreed: how many decisions would have been taken
+    otherwise here.
     """
 
-    def __init__(self, rate, gyro_scale, accel_lsb_per_g, axes=9, lite=False, **parameters):
+    def __init__(self, rate, gyro_scale, accel_lsb_per_g, axes=9, **parameters):
         p = self.chosen(DEFAULTS, parameters)
-        self.p = p
+        self.p, self.axes = p, axes
         self.dt = 1 / rate
         self.block = block_of(rate)
-        self.T = self.block / rate
+        self.pace = max(1, -(-PARTS // self.block))
+        self.T, self.T2 = self.block / rate, 2 * self.block / rate
         self.gyro = math.radians(1 / gyro_scale)
         self.lsb = accel_lsb_per_g
-        self.axes, self.lite = axes, lite
-        self.base = [0.0, 0.0, 0.0]
-        self.b = [0.0, 0.0, 0.0]
-        self.information = [INFORMATION_FIRST] * 3
-        self.phase = 1
-        self.gyro_sum = [0, 0, 0]
-        self.blocks = 0  # of the rest detector
+        self.ramp = round(p["ramp_tilt"] * 256) / 256
+        self.bias_start = math.radians(p["bias_start_dps"])
+        self.rest_noise = math.radians(p["rest_noise"]) ** 2  # of 1 s
+        self.rest_after = max(1, self.pairs(p["rest_after"]))
+        self.base = [0.0] * 3
+        self.R = rows([1.0, 0.0, 0.0, 0.0])
+        self.P = [[0.0] * 4 for _ in range(4)]
+        self.phase, self.axis, self.side = 1, 0, 0
+        self.gyro_sum = [0] * 3
+        self.held = 0.0
+        self.blocks = self.still = 0  # of the rest detector
         self.low1, self.low2 = [0.0] * 6, [0.0] * 6
-        self.still = self.rest = 0
-        self.field, self.reference, self.candidate = None, None, None
-        self.near = self.candidate_for = 0
-        self.rejected = self.whole(p["reject_for"])
-        self.weight = 1.0 if lite else 0.0
-        self.tilt_weight = 1.0
-        self.ramp_tilt, self.ramp_heading = (
-            round(p[name] * 256) / 256 for name in ("ramp_tilt", "ramp_heading")
-        )
-        self.late = int(p["bias_after"] * rate + 0.5)
+        self.e = self.candidate_e = self.still_e = 0.0
+        self.field = self.reference = self.old = self.candidate = None
+        self.near = self.seen = self.old_seen = self.candidate_for = self.back = self.steady = 0
+        self.good = False
+        self.weight = 0
         self.decided = self.disagreed = 0
+        self.set_bias([0.0] * 3)
         self.set_quaternion([1.0, 0.0, 0.0, 0.0])
 
     def whole(self, seconds):
         """Blocks."""
         return int(seconds / self.T + 0.5)
 
+    def pairs(self, seconds):
+        return int(seconds / self.T2 + 0.5)
+
+    @property
+    def rest(self):
+        return self.still == self.rest_after
+
+    def set_bias(self, counts, known_s=0):
+        for i in range(3):
+            self.low1[3 + i] += self.base[i] - counts[i]
+            self.low2[3 + i] += self.base[i] - counts[i]
+        self.base = list(counts)
+        self.b = [0.0] * 3
+        self.open_bias()
+        if known_s > 0:
+            for i in range(1, 4):
+                self.P[i][i] = min(self.P[i][i], math.radians(0.5) ** 2 / known_s)
+        self.wait = 0
+
     def set_quaternion(self, q):
         norm = math.sqrt(sum(v * v for v in q))
         self.q = [v / norm for v in q]
-        self.n = self.heading_n = self.lost = 0
-        self.s = [0.0, 0.0, 1.0]
-        self.c = [0.0, 0.0, 0.0]  # correction (earth), rad/s
-        self.C = [0.0, 0.0, 0.0]  # correction (body) that the next step applies, rad
-        self.d = 0.0
-        self.x, self.y, self.z = [0.0] * 6, [0.0] * 6, [0.0] * 3
-        self.zk = self.push = 0.0
-        self.mag_sum = [0.0, 0.0, 0.0]
+        self.last = [0.0] * 3  # what the step before turned by
+        self.turn = [0.0] * 3  # correction (earth) that the next step takes up, rad
+        self.force_sum, self.mag_sum = [0.0] * 3, [0.0] * 3
         self.mag_n = self.since = self.j = self.gap = 0
+        self.full = self.clipped = 0
+        self.n = self.lean = 0
+        self.part = self.part_end = 0
+        self.s, self.lean_s = [0.0, 0.0, 1.0], [0.0, 0.0]
+        self.off = [0.0, 0.0]
+        self.c = [0.0, 0.0]  # tilt correction of this block, rad
+        self.x, self.y = [0.0] * 6, [0.0] * 6
+        self.d, self.tilt_weight = 0.0, 1.0
+        self.wait = self.lost = 0
+        self.wait_e = self.wait_turn = 0.0
+        self.own = self.still_set = False
+        self.dx = [0.0] * 4
+        self.P[0] = [OPEN if self.axes == 9 else SIX, 0.0, 0.0, 0.0]
+        for i in range(1, 4):
+            self.P[i][0] = 0.0
+        self.doubt = math.sqrt(self.P[0][0])
+
+    def open_heading(self, variance):
+        """The heading's variance is at least this from now on."""
+        self.still_set = False
+        if variance > self.P[0][0]:
+            self.P[0] = [variance, 0.0, 0.0, 0.0]
+            for i in range(1, 4):
+                self.P[i][0] = 0.0
+            self.doubt = math.sqrt(variance)
+
+    def open_bias(self):
+        """Nothing is known of the biases any more."""
+        for i in range(1, 4):
+            self.P[0][i] = 0.0
+            self.P[i] = [0.0] * 4
+            self.P[i][i] = self.bias_start**2
 
     # -- one step
     def update(self, counts, decisions=None):
         fresh = counts[10] & 1
-        dt = self.dt
-        turn = [(counts[3 + i] - self.base[i]) * self.gyro * dt - self.b[i] * dt for i in range(3)]
+        a, dt = self.last, self.dt
+        b = self.last = [
+            (counts[3 + i] - self.base[i]) * self.gyro * dt - self.b[i] * dt for i in range(3)
+        ]
+        turn = [
+            b[0] + (a[1] * b[2] - a[2] * b[1]) / 12,
+            b[1] + (a[2] * b[0] - a[0] * b[2]) / 12,
+            b[2] + (a[0] * b[1] - a[1] * b[0]) / 12,
+        ]
         if fresh:
-            turn = [turn[i] + self.C[i] for i in range(3)]
+            R, f = self.R, self.turn
+            turn = [turn[i] + R[0][i] * f[0] + R[1][i] * f[1] + R[2][i] * f[2] for i in range(3)]
+            self.turn = [0.0] * 3
         self.q = turned(self.q, turn)
         if not fresh:
             self.gap += 1
             return
-        if self.gap >= int(self.p["outage"] / dt + 0.5):
-            self.n = self.heading_n = 0
-        self.gap = 0
         self.forced = decisions
-        self.n += 1
-        K = max(1 / self.p["tau_tilt"], 1 / (self.ramp_tilt * self.n * dt + 2 * dt))
+        if self.gap >= max(1, int(self.p["outage"] / dt + 0.5)):
+            self.n = 0
+            self.open_heading(OPEN)
+        self.gap = 0
+        if counts[10] & 8:
+            self.clipped += 1
+            self.full += 1
+        else:
+            if self.full >= FULL_MOST:
+                self.n = 0
+            self.full = 0
         R = self.R = rows(self.q)
         a = counts[0:3]
-        h = [(r[0] * a[0] + r[1] * a[1] + r[2] * a[2]) / self.lsb for r in R]
-        s = self.s
-        k = 2 * K * dt
-        self.off = [h[i] - s[i] for i in range(3)]
         for i in range(3):
-            s[i] += k * self.off[i]
-        c0, c1 = clamp(K * s[1], K), clamp(-K * s[0], K)
-        if self.decide(OVER, s[2] < 0):
-            n = math.sqrt(s[0] * s[0] + s[1] * s[1])
-            if n < 1:
-                c0, c1 = 1.4 * c0 / (n + 1 / 1024), 1.4 * c1 / (n + 1 / 1024)
-        self.K, self.c = K, [c0, c1]
-        self.C = [(R[0][i] * c0 + R[1][i] * c1) * dt for i in range(3)]
-        for i in range(3):
+            self.force_sum[i] += (R[i][0] * a[0] + R[i][1] * a[1] + R[i][2] * a[2]) / self.lsb
             self.gyro_sum[i] += counts[3 + i]
         self.gather(counts)
-        if self.phase == 0:
-            self._rest(counts)
-        elif self.phase == 1:
-            self._regressors()
-        elif self.phase == 2:
+        if self.phase % self.block == 0:
+            self.part, self.part_end = 0, LEVELLING if self.phase else PARTS
+        self.phase = (self.phase + 1) % (2 * self.block)
+        for _ in range(self.pace):
+            if self.part < self.part_end:
+                self._work(counts)
+                self.part += 1
+
+    def _work(self, counts):
+        part = self.part
+        if part == 0:
+            self._close(counts)
+            self._level()
+        elif part == 1:
+            self._regress()
+        elif part == 2:
+            self._rest()
+        elif part == 3:
             self._compass()
-        elif self.phase == 3 and self.j and not self.lite:
-            self._field(counts)
-        # a block of four steps has no room for one part a step
-        if self.phase == (3 if self.block == 4 else 4):
-            self._steer()
-        if self.phase == (3 if self.block == 4 else 5):
-            self._bias()
-        self.phase = (self.phase + 1) % self.block
+        elif part == 4 and self.j:
+            self._smooth_field()
+            self._judge_field()
+        elif part == 5:
+            self._grow()
+        elif part in (6, 7):
+            self._measure_heading(alone=part == 7)
+        elif part == 8:
+            self._measure_bias()
+        elif part == 9:
+            self._apply()
 
-    # -- parts of a block
-    def _rest(self, counts):
-        """Rest: gyro and accelerometer stay near their two-pole low-passes."""
-        self.blocks += 1
-        k = max(1 / self.blocks, self.T / (REST_TAU + self.T))
-        mean = [v / self.block - self.base[i] for i, v in enumerate(self.gyro_sum)]
-        self.gyro_sum = [0, 0, 0]
-        now = [counts[3 + i] - self.base[i] for i in range(3)] + list(counts[0:3])
-        size = [0.0, 0.0]
-        for i, v in enumerate(mean + list(counts[0:3])):
-            self.low1[i] += k * (v - self.low1[i])
-            self.low2[i] += k * (self.low1[i] - self.low2[i])
-            size[i // 3] += (now[i] - self.low2[i]) ** 2
-        dps = math.radians(1) / self.gyro
-        still = size[0] < (self.p["rest_gyro_dps"] * dps) ** 2
-        still = still and size[1] < (self.p["rest_accel_g"] * self.lsb) ** 2
+    # -- levelling
+    def _close(self, counts):
+        """The end of a block: its means; the gain k of this block; the watch for a lost tilt."""
+        p, T = self.p, self.T
+        self.h = [v / self.block for v in self.force_sum]
+        self.mean = [v / self.block - self.base[i] for i, v in enumerate(self.gyro_sum)]
+        self.force_sum, self.gyro_sum = [0.0] * 3, [0] * 3
+        self.sample = [*counts[0:3], *(counts[3 + i] - self.base[i] for i in range(3))]
+        self.rate = sum((self.mean[i] * self.gyro - self.b[i]) ** 2 for i in range(3))
+        if self.rate > self.held:
+            self.held = self.rate
+        else:
+            self.held += T / (2 * p["tau_start"] + T) * (self.rate - self.held)
+        for i in range(2):
+            self.lean_s[i] += T / (LEAN_TAU + T) * (self.h[i] - self.lean_s[i])
+        if self.decide(LEANS, math.hypot(*self.lean_s) > p["lost_g"]):
+            self.lean += 1
+            if self.lean > self.whole(LEAN_AFTER):
+                self.n = self.lean = 0
+                self.open_heading(OPEN)
+        else:
+            self.lean = max(0, self.lean - 2)
+        vague = any(self.P[i][i] > self.bias_start**2 / 125 for i in range(1, 4))
+        if self.decide(VAGUE, vague):
+            tau = p["tau_start"]
+        else:
+            turns = math.sqrt(self.held) / math.radians(100)
+            tau = p["tau_turning"] / math.sqrt(turns) if turns else p["tau_slow"]
+            tau = min(p["tau_slow"], max(p["tau_fast"], tau))
+        self.n += 1
+        self.k = min(0.5, max(T / tau, 1 / (self.ramp * self.n + 1)))
+
+    def _level(self):
+        h, s, k = self.h, self.s, self.k
+        self.off = [h[i] - s[i] for i in range(2)]
         for i in range(3):
-            still = still and abs(self.low2[i]) <= self.p["bias_limit_dps"] * dps
-            if self.information[i] > INFORMATION_KNOWN:
-                off = abs(self.low2[i] - self.b[i] / self.gyro)
-                still = still and off <= self.p["rest_dps"] * dps
-        self.still = self.still + 1 if self.decide(STILL, still) else 0
-        after = max(1, self.whole(self.p["rest_after"]))
-        upset = math.hypot(*self.s[:2]) > self.p["upset_g"]
-        if self.decide(UPSET, self.still >= after and upset):
-            self.n = self.still = 0
-            if not self.lite:
-                self.heading_n = 0
-        self.rest = self.still >= after
+            s[i] += 2 * k * (h[i] - s[i])
+        x, y = clamp(s[0], 1.0), clamp(s[1], 1.0)
+        if self.decide(OVER, s[2] < 0):
+            n = math.hypot(x, y)
+            if n < 1:
+                x, y = 1.4 * x / (n + 1 / 1024), 1.4 * y / (n + 1 / 1024)
+        self.c = [k * y, -k * x]
+        self.turn[0:2] = [clamp(v, TURN_MOST) for v in self.c]
 
-    def _regressors(self):
-        """The earth's horizontal axes in the body, filtered as the tilt correction is."""
-        k = min(0.5, self.K * self.T)
+    def _regress(self):
+        """The earth's horizontal axes in the body, filtered as the tilt correction is; the tilt's confidence."""
+        k = self.k
         v = [*self.R[0], *self.R[1]]
         for i in range(6):
             self.x[i] += 2 * k * (v[i] - self.y[i] - self.x[i])
             self.y[i] += k * self.x[i]
-        off = sum(clamp(v, 3.0) ** 2 for v in self.off[:2]) / HALF_WEIGHT_G**2
+        off = sum(clamp(v, 3.0) ** 2 for v in self.off) / self.p["accel_doubt_g"] ** 2
         self.d += 2 * k * (off - self.d)
         self.tilt_weight = 1 / (1 + self.d)
 
+    # -- rest
+    def _rest(self):
+        """Rest: gyro and accelerometer stay near their two-pole low-passes."""
+        p, low2 = self.p, self.low2
+        self.blocks += 1
+        k = max(1 / self.blocks, self.T2 / (REST_TAU + self.T2))
+        size = [0.0, 0.0]
+        for i, v in enumerate(self.sample[0:3] + self.mean):
+            self.low1[i] += k * (v - self.low1[i])
+            low2[i] += k * (self.low1[i] - low2[i])
+            size[i // 3] += (self.sample[i] - low2[i]) ** 2
+        dps = math.radians(1) / self.gyro
+        still = size[0] < (p["rest_accel_g"] * self.lsb) ** 2
+        still = still and size[1] < (p["rest_gyro_dps"] * dps) ** 2
+        still = still and max(abs(v) for v in low2[3:6]) <= p["bias_limit_dps"] * dps
+        off = [low2[3 + i] * self.gyro - self.b[i] for i in range(3)]
+        n = 0
+        if self.decide(STILL, still):
+            n = self._contradicted(off, min(self.still + 1, self.rest_after))
+        else:
+            self.wait = 0
+        if n == self.rest_after:
+            jumped = max(abs(v) for v in off) > math.radians(JUMP_DPS)
+            jumped = jumped and self.P[1][1] > self.bias_start**2 / 5
+            jumped = self.decide(JUMPED, self.still < n and jumped)
+            if jumped:
+                self.n = 0
+            upset = math.hypot(*self.s[0:2]) > p["upset_g"]
+            upset = self.decide(UPSET, self.n > self.whole(SOON) and upset)
+            if upset:
+                self.n = n = 0
+            if jumped or upset:
+                self.open_heading(OPEN)
+        self.still = n
+
+    def _contradicted(self, off, n):
+        """A rest that contradicts a known bias is believed when it has lasted as long as the one before.
+
+        n: blocks of rest, with this one -> the same, or less.
+        """
+        known = [
+            self.P[1 + i][1 + i]
+            for i in range(3)
+            if abs(off[i]) > math.radians(self.p["rest_dps"])
+            and self.P[1 + i][1 + i] < 5 * self.rest_noise
+        ]
+        if not self.decide(CONTRADICTS, bool(known)):
+            self.wait = 0
+            return n
+        self.wait += 1
+        if self.wait == 1:
+            self.wait_e, self.wait_turn, self.wait_a = self.e, 0.0, self.low2[0:3]
+        turn = abs(sum(u * v for u, v in zip(self.R[2], off, strict=True))) * self.wait * self.T2
+        turned = sum((a - b) ** 2 for a, b in zip(self.low2, self.wait_a, strict=False))
+        turned = turned > (WAIT_MOVED_G * self.lsb) ** 2
+        adopt = False
+        if not turned and known and self.wait >= self._patience(min(known)):
+            if self._field_known() and self.decided & NEAR_REFERENCE:
+                # what the gyro says the heading turned by; the magnetometer knows better
+                if turn >= TURN_SURE or self.wait >= self.pairs(WAIT_SURE):
+                    moved = wrap(self.e - self.wait_e) + self.wait_turn
+                    turned = turn > TURN_LEAST and abs(moved) < turn / 2
+                    adopt = not turned
+            else:
+                adopt = not self._field_known() or self.wait >= self.pairs(WAIT_FIELD)
+        turned = self.decide(TURNED, turned)
+        if self.decide(ADOPT, adopt):
+            self.open_bias()
+            self.open_heading(min(OPEN, (math.sqrt(self.P[0][0]) + turn) ** 2))
+            self.wait = 0
+            return n
+        if turned:
+            self.wait = 0
+            return 0
+        return min(n, self.rest_after - 1)
+
+    def _field_known(self):
+        return self.axes == 9 and self.reference is not None and self.since < 16
+
+    def _patience(self, variance):
+        """Blocks of rest that would give this variance."""
+        most = max(1, self.pairs(self.p["rest_wait"]))
+        return max(self.rest_after, min(most, int(self.rest_noise / self.T2 / variance)))
+
+    # -- magnetic field
     def _compass(self):
         """The heading error, and the pair (horizontal, vertical) field."""
         self.since = min(16, self.since + 1)
@@ -248,108 +493,229 @@ class InertialFloat(EarthFloat):
         if not self.mag_n:
             return
         n, w, up = (v / self.mag_n for v in self.mag_sum)
-        self.mag_sum, self.mag_n = [0.0, 0.0, 0.0], 0
+        self.mag_sum, self.mag_n = [0.0] * 3, 0
         self.j, self.since = self.since, 0
         self.e = math.atan2(-w, n)
         self.now = math.hypot(n, w), up
 
-    def _steer(self):
-        """The turn about up that the heading error asks for, bounded; it never touches tilt."""
-        self.push = self.zk = 0.0
-        if not (self.j and self.weight):
-            self.j = 0
-            return
-        e, j = self.e, self.j
-        u = sum(self.R[2][i] ** 2 / self.information[i] for i in range(3))
-        self.heading_n += j
-        if not self.lite:
-            far = self.decide(FAR, abs(e) > self.p["restart_rad"])
-            good = self.weight == 1 and self.reference
-            self.lost = self.lost + j if far and good else max(0, self.lost - j)
-            if self.lost > self.whole(self.p["restart_after"]):
-                self.heading_n = self.lost = 0
-        slow = self.T * max(1 / self.p["tau_heading"], u / self.p["tau_doubt"])
-        ramp = 1 / (self.ramp_heading * self.heading_n + 2 * j)
-        if ramp <= slow or self.heading_n >= self.whole(LIMIT_AFTER):
-            e = clamp(e, LIMIT + LIMIT_U * u)
-        k = min(max(slow, ramp) * self.weight, 0.5 / j)
-        self.push = k * e
-        self.zk = k * j
-        angle = clamp(self.push * j, 0.5)
-        for i in range(3):
-            self.C[i] += self.R[2][i] * angle
-
-    def _field(self, counts):
-        """The weight of the heading: whether the field is that of the reference."""
-        p, now, j = self.p, self.now, self.j
+    def _smooth_field(self):
+        """The field smoothed, and what it is like."""
+        p, e, doubt = self.p, self.e, self.doubt
         if self.field is None:
-            self.field, self.candidate = list(now), list(now)
-        f, d = self.field, self.candidate
-        k = j * self.T / (FIELD_SMOOTH + j * self.T)
+            self.field, self.candidate, self.candidate_e = list(self.now), list(self.now), e
+        f, r = self.field, self.reference
+        t = self.j * self.T2
         for i in range(2):
-            f[i] += k * (now[i] - f[i])
+            f[i] += t / (FIELD_SMOOTH + t) * (self.now[i] - f[i])
 
-        def near(r):
-            return math.hypot(f[0] - r[0], f[1] - r[1]) < p["field_tolerance"] * math.hypot(*r)
+        def away(r):
+            return math.hypot(f[0] - r[0], f[1] - r[1]) / math.hypot(*r) if r else math.inf
 
-        k, ok, r = min(1 / 16, j * self.T / (p["field_tau"] + j * self.T)), False, self.reference
-        if self.decide(NEAR_REFERENCE, r is not None and near(r)):
-            self.near += j
-            if self.near >= max(1, self.whole(p["field_after"])):
-                ok = True
-                for i in range(2):
-                    r[i] += k * (f[i] - r[i])
+        def distance(r):
+            return math.hypot(f[0] - r[0], f[1] - r[1])
+
+        near = r is not None and away(r) < p["field_tolerance"]
+        self.decide(NEAR_REFERENCE, near)
+        old = self.old is not None and away(self.old) < p["field_tolerance"]
+        self.decide(NEAR_OLD, old and not (near and distance(self.old) >= distance(r)))
+        self.decide(SAME, r is not None and away(r) < SAME_TOLERANCE)
+        self.decide(TURNING, self.rate >= math.radians(p["field_dps"]) ** 2)
+        consistent = abs(e) < p["field_gate"] + GATE_DOUBT * doubt
+        if r is not None and self.still_set and self.rest:
+            consistent = consistent and abs(wrap(e - self.still_e)) <= STILL_E
+        self.decide(CONSISTENT, consistent)
+        candidate = away(self.candidate) < p["field_tolerance"]
+        if r is not None and not self.good:
+            candidate = candidate and abs(wrap(e - self.candidate_e)) < CANDIDATE_E + doubt
+        self.decide(NEAR_CANDIDATE, candidate)
+        self.decide(FORGET, self.P[0][0] > FORGOTTEN)
+
+    def _judge_field(self):
+        """Whether the heading of this field is believed; whether another field takes the reference's place."""
+        p, j, e, f, has = self.p, self.j, self.e, self.field, self.decided
+        after = max(1, self.pairs(p["field_after"]))
+        good = False
+        near = 0
+        if has & NEAR_REFERENCE and has & CONSISTENT:
+            near = min(after, self.near + j)
+            good = near == after
+            if good and has & TURNING:
+                self.seen = min(self.pairs(FOR_MOST), self.seen + j)
+        if good or not has & NEAR_CANDIDATE:
+            self.candidate_for = 0
+        elif self.reference is None or has & (TURNING | FORGET):
+            self.candidate_for += j
+        k = min(1 / 16, j * self.T2 / (p["field_tau"] + j * self.T2))
+        for i in range(2):
+            if good:
+                self.reference[i] += k * (f[i] - self.reference[i])
+            if has & NEAR_CANDIDATE:
+                self.candidate[i] += k * (f[i] - self.candidate[i])
+            else:
+                self.candidate[i] = f[i]
+        if not has & NEAR_CANDIDATE or good or self.reference is None:
+            self.candidate_e = e
         else:
-            self.near = 0
-        rate = math.sqrt(
-            sum(((counts[3 + i] - self.base[i]) * self.gyro - self.b[i]) ** 2 for i in range(3))
-        )
-        turning = self.decide(TURNING, rate >= math.radians(p["field_dps"]))
-        if self.decide(NEAR_CANDIDATE, near(d)):
-            if turning or r is None:
-                self.candidate_for += j
-            for i in range(2):
-                d[i] += k * (f[i] - d[i])
+            self.candidate_e = wrap(self.candidate_e + k * wrap(e - self.candidate_e))
+        restart = self._own_error()
+        if restart:
+            near, good, self.candidate_for = after, True, 0
+        elif not good and near == 0:
+            taken = self._another_reference()
+            if taken:
+                near, good, self.candidate_for = after, True, 0
+                restart = taken == "restart"
+        self.near, self.good = near, good
+        if restart:
+            # the heading may be off by e, and the bias is what made it so
+            self.open_heading(min(OPEN, e * e))
+            self.open_bias()
+        self.weight = int(good or self.reference is None)
+        if self.weight:
+            if self.still_set and self.rest:
+                k = self.T2 / (STILL_TAU + self.T2)
+                self.still_e += k * wrap(e - self.still_e)
+            else:
+                self.still_set, self.still_e = True, e
+
+    def _own_error(self):
+        """The field is what it was, and its heading is another, for restart_after: the attitude is wrong."""
+        has, j, most = self.decided, self.j, max(1, self.pairs(STEADY_MOST))
+        self.steady = min(most, self.steady + j) if has & SAME else 0
+        if self.reference is None or has & CONSISTENT:
+            self.lost = max(0, self.lost - 2 * j)
+            self.own = self.steady == most
+        elif self.own and self.steady:
+            self.lost += 2 * j if has & TURNING else j
+            if self.lost > self.pairs(2 * self.p["restart_after"]):
+                self.lost = 0
+                return True
         else:
-            self.candidate_for, self.candidate = 0, list(f)
-        after = self.whole(p["field_new"] if r else p["field_first"])
-        agrees = self.decide(AGREES, abs(self.e) < p["field_agree"]) or r is None
-        if not ok and self.near == 0 and self.candidate_for >= after and agrees:
-            self.reference, self.near, ok = list(self.candidate), self.whole(p["field_after"]), True
-        if ok:
-            self.rejected = max(0, self.rejected - 2 * j)
-            self.weight = 1.0
+            self.lost, self.own = 0, False
+        return False
+
+    def _another_reference(self):
+        """The candidate becomes the reference -> True, "restart" where the heading is another's; False: it does not."""
+        p, has = self.p, self.decided
+        r = self.reference
+        need, n, returns = self.pairs(p["field_first"]), self.candidate_for, False
+        if r is not None:
+            if not has & FORGET:
+                need = min(self.pairs(NEED_MOST), 2 * self.seen + self.pairs(NEED))
+                if has & CONSISTENT:
+                    need = min(need, self.pairs(p["field_new"]))
+            if has & NEAR_OLD:
+                self.back += self.j
+                need = min(need, self.pairs(BACK_AFTER))
+                returns = self.back >= n
+                n = max(n, self.back)
+            else:
+                self.back = 0
+        if n < need:
+            return False
+        restart = r is not None and (not has & CONSISTENT or returns)
+        n = min(n, self.pairs(FOR_MOST))
+        if returns:
+            n = max(n, self.old_seen)
+        if r is not None and (restart or not has & NEAR_REFERENCE):
+            self.old, self.old_seen, self.back = r, self.seen, 0
+        self.reference, self.seen = list(self.candidate), n
+        return "restart" if restart else True
+
+    # -- heading and bias
+    def _grow(self):
+        """P after two blocks: the heading turns away by -up . bias; heading and bias walk."""
+        p, P, T, U = self.p, self.P, self.T2, self.R[2]
+        start = self.bias_start**2
+        v = [sum(P[1 + i][1 + k] * U[k] for k in range(3)) for i in range(3)]
+        c = sum(U[i] * P[0][1 + i] for i in range(3))
+        u = sum(U[i] * v[i] for i in range(3))
+        for i in range(3):
+            P[0][1 + i] -= T * v[i]
+            P[1 + i][0] = P[0][1 + i]
+        level = math.radians(p["bias_walk_level"]) ** 2 * T
+        up = math.radians(p["bias_walk"]) ** 2 * T
+        for i in range(3):
+            if P[1 + i][1 + i] >= start:
+                continue
+            for k in range(i + 1):
+                if P[1 + k][1 + k] < start:
+                    x = P[1 + i][1 + k] + (up - level) * U[i] * U[k]
+                    if k == i:
+                        x = min(start, x + level)
+                    P[1 + i][1 + k] = P[1 + k][1 + i] = x
+        x = P[0][0] - 2 * T * c + T * T * u + T * (WALK**2 + p["scale_error"] ** 2 * self.rate)
+        if self.clipped:
+            # a gyro at full scale may have missed as much again
+            missed = self.clipped * 32768 * self.gyro * self.dt
+            x = max(x, min(OPEN, (math.sqrt(P[0][0]) + missed) ** 2))
+            self.clipped = 0
+        if x > OPEN:
+            x = OPEN
+            for i in range(1, 4):
+                P[0][i] *= 15 / 16
+                P[i][0] = P[0][i]
+        P[0][0] = x
+        self.doubt = math.sqrt(x)
+
+    def _take(self, row, value, noise, errors=4):
+        """The measurement value = row . x of this variance, into the first so many errors: 4, 1 the heading alone."""
+        P, dx = self.P, self.dx
+        z = [sum(P[i][k] * row[k] for k in range(4)) for i in range(4)]
+        total = max(0.0, sum(z[i] * row[i] for i in range(4))) + noise
+        value -= sum(dx[i] * row[i] for i in range(4))
+        unit = math.sqrt(2) * self.bias_start
+        for i in range(errors):
+            dx[i] = clamp(dx[i] + z[i] * value / total, 4 * (unit if i else 2.5))
+            for k in range(i, 4):
+                P[i][k] -= z[i] * z[k] / total
+                P[k][i] = P[i][k]
+            P[i][i] = max(P[i][i], LEAST * (unit if i else 2.5) ** 2)
+
+    def _measure_heading(self, alone):
+        if not (self.j and self.weight):
             return
-        self.weight = REJECTED_WEIGHT
-        if self.rejected <= self.whole(p["reject_for"]):
-            self.rejected += j
-            self.weight = 0.0
-        if not self.reference:
-            self.weight = 1.0
+        noise = self.p["mag_noise"] ** 2 / (self.j * self.T2)
+        if self.n > self.whole(self.p["bias_after"]):
+            noise *= SPLIT / (SPLIT - 1) if alone else SPLIT
+        elif not alone:
+            return
+        e = clamp(self.e, LIMIT + LIMIT_DOUBT * self.doubt)
+        self._take([1, 0, 0, 0], e, noise, 1 if alone else 4)
 
-    def _bias(self):
-        """Information, bias and the regressor of the heading."""
-        T, b, info, y = self.T, self.b, self.information, self.y
+    def _measure_bias(self):
+        """At rest the gyro's axes in turn, in motion the tilt correction north and west."""
+        p, unit = self.p, math.sqrt(2) * self.bias_start
+        self.axis = (self.axis + 1) % 3
+        if self.rest:
+            i = self.axis
+            row = [0.0] * 4
+            row[1 + i] = 1.0
+            off = self.low2[3 + i] * self.gyro - self.b[i]
+            self._take(row, clamp(off, 4 * unit), self.rest_noise / self.T2 / 3)
+            return
+        late, full = self.whole(p["bias_after"]), self.whole(p["bias_full"])
+        full = max(late + 1, full)
+        if self.n <= late:
+            return
+        i = self.side
+        self.side = 1 - i
+        noise = min(TILT_MOST * unit**2, math.radians(p["tilt_noise"]) ** 2 / self.T2 / 2)
+        noise /= self.tilt_weight
+        if self.n < full:
+            noise *= (full / self.n) ** 2
+        value = clamp(-self.c[i] / self.T, 4 * unit)
+        self._take([0.0, *self.y[3 * i : 3 * i + 3]], value, min(noise, NOISE_MOST * unit**2))
+
+    def _apply(self):
+        limit = math.radians(self.p["bias_limit_dps"])
         for i in range(3):
-            self.z[i] += self.zk * (self.R[2][i] - self.z[i])
-        z = self.z
-        late = self.n > self.late
-        rate = clamp(self.push / T, math.radians(HEADING_RATE_DPS))
-        for i in range(3):
-            if info[i] > INFORMATION_FIRST:
-                info[i] -= T * (info[i] / INFORMATION_MOTION) ** 2
-            u = 0.0
-            if self.rest:
-                info[i] += REST_WEIGHT * T
-                u = -REST_WEIGHT * T * (self.low2[i] * self.gyro - b[i])
-            elif late:
-                w = self.tilt_weight * T
-                info[i] += w * (y[i] ** 2 + y[3 + i] ** 2)
-                u = w * (y[i] * self.c[0] + y[3 + i] * self.c[1])
-                w = HEADING_WEIGHT * self.j * T
-                info[i] += w * z[i] ** 2
-                u += w * z[i] * rate
-            b[i] = clamp(b[i] - u / info[i], math.radians(self.p["bias_limit_dps"]))
+            self.b[i] = clamp(self.b[i] + self.dx[1 + i], limit)
+        turn = self.turn[2] = clamp(self.dx[0], TURN_MOST)
+        self.dx = [0.0] * 4
+        if abs(self.wait_turn + turn) < 2:
+            self.wait_turn += turn
+        self.still_e = wrap(self.still_e - turn)
 
 
 def turned(q, angle):

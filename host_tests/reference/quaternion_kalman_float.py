@@ -39,6 +39,7 @@ DEFAULTS = {
     "rest_after": 1.5,  # s
     "field_tolerance": 0.2,
 }
+BLOCKS_HZ = 45
 GRAVITY = 9.80665
 SEEDED, HEADING_START = math.radians(12), math.radians(5)
 OPEN = 0.75  # rad: (0.75 rad)**2 is 603979776 in Q30
@@ -75,7 +76,7 @@ class QuaternionKalmanFloat(EarthFloat):
     def __init__(self, rate, gyro_scale, accel_lsb_per_g, axes=9, **parameters):
         p = self.chosen(DEFAULTS, parameters)
         self.p, self.axes = p, axes
-        self.block = block_of(rate)
+        self.block = block_of(rate, BLOCKS_HZ)
         self.T = T = self.block / rate
         self.dt = 1 / rate
         self.lsb, self.gyro_scale = accel_lsb_per_g, gyro_scale
