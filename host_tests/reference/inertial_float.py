@@ -34,9 +34,9 @@ units, true roots and angles, and no rounding. Yes/no decisions are taken here, 
 #     tilt, moving  -(turn_north, turn_west) / T = (y_north, y_west) . bias, tilt_noise**2 (1 + D)
 #     rest          low-passed gyro - b: the bias, rest_noise**2
 # y_north and y_west are the first two rows of R, low-passed as the tilt is; D is the low-pass of |h - s|**2 /
-# accel_doubt_g**2. The compass's innovation is bounded by 0.02 rad + 0.7 doubt, doubt**2 = P(heading). Its
-# noise is split: one measurement with 4.4 times the variance corrects heading and bias, another, with what is left,
-# the heading alone. So a field that is slowly wrong teaches the bias little.
+# accel_doubt_g**2. The compass's innovation is bounded by 0.02 rad + 0.7 doubt, doubt**2 = P(heading); P stays as it
+# is when it was. What is wrong with a field lasts, and is no noise: so of the gain by which the compass corrects the
+# biases only 0.22 is taken, and P is what that leaves: P - (K z' + z K' - K S K'), z = P row', S = row z + variance.
 # After two blocks b takes up the bias's part of x, `turn` about up the heading's; the tilt is never touched.
 #
 # A start, a restart of the tilt, or a gyro at full scale make P(heading) larger again, as far as 3 rad**2; what
@@ -104,7 +104,7 @@ DEFAULTS = {
     "outage": 0.5,
 }
 BLOCKS_HZ = 23
-PARTS, LEVELLING = 10, 2  # parts of the work of a block; of every other block there are but these
+PARTS, LEVELLING = 9, 2  # parts of the work of a block; of every other block there are but these
 TURN_MOST = 0.5  # rad a block: each part of a correction
 LEAN_TAU, LEAN_AFTER = 0.5, 2.0  # s
 FULL_MOST = 10  # samples with a gyro at full scale, after which the tilt starts again
@@ -127,7 +127,7 @@ OPEN, SIX = (
 WALK = 0.0006  # rad per root s
 LIMIT, LIMIT_DOUBT = 0.02, 0.6875  # rad, 1
 GATE_DOUBT = 1.125
-SPLIT = 4.4
+SHARE = 0.22  # of the gain with which the heading corrects the biases
 LEAST = 2.0**-24  # of a variance, in units of (2.5 rad)**2 or 2 bias_start**2
 NOISE_MOST, TILT_MOST = 512.0, 16.0  # of a measurement, in units of 2 bias_start**2
 
@@ -194,13 +194,14 @@ class InertialFloat(EarthFloat):
         self.lsb = accel_lsb_per_g
         self.ramp = round(p["ramp_tilt"] * 256) / 256
         self.bias_start = math.radians(p["bias_start_dps"])
+        self.unit = math.sqrt(2) * self.bias_start
         self.rest_noise = math.radians(p["rest_noise"]) ** 2  # of 1 s
         self.rest_after = max(1, self.pairs(p["rest_after"]))
         self.base = [0.0] * 3
         self.R = rows([1.0, 0.0, 0.0, 0.0])
         self.P = [[0.0] * 4 for _ in range(4)]
         self.phase, self.axis, self.side = 1, 0, 0
-        self.gyro_sum = [0] * 3
+        self.gyro_sum, self.pair_sum = [0] * 3, [0] * 3
         self.held = 0.0
         self.blocks = self.still = 0  # of the rest detector
         self.low1, self.low2 = [0.0] * 6, [0.0] * 6
@@ -245,6 +246,8 @@ class InertialFloat(EarthFloat):
         self.mag_n = self.since = self.j = self.gap = 0
         self.full = self.clipped = 0
         self.n = self.lean = 0
+        self.pair_sum = [0] * 3
+        self.k_pace = self.T / self.p["tau_start"]
         self.part = self.part_end = 0
         self.s, self.lean_s = [0.0, 0.0, 1.0], [0.0, 0.0]
         self.off = [0.0, 0.0]
@@ -330,30 +333,44 @@ class InertialFloat(EarthFloat):
         elif part == 1:
             self._regress()
         elif part == 2:
+            self._pace()
             self._rest()
         elif part == 3:
-            self._compass()
+            if self.axes == 9:
+                self._compass()
+            else:
+                self.part += 1
         elif part == 4 and self.j:
             self._smooth_field()
             self._judge_field()
         elif part == 5:
             self._grow()
-        elif part in (6, 7):
-            self._measure_heading(alone=part == 7)
-        elif part == 8:
+        elif part == 6:
+            self._measure_heading()
+        elif part == 7:
             self._measure_bias()
-        elif part == 9:
+        elif part == 8:
             self._apply()
 
     # -- levelling
     def _close(self, counts):
-        """The end of a block: its means; the gain k of this block; the watch for a lost tilt."""
-        p, T = self.p, self.T
+        """The end of a block: its means; the gain k of this block."""
         self.h = [v / self.block for v in self.force_sum]
-        self.mean = [v / self.block - self.base[i] for i, v in enumerate(self.gyro_sum)]
+        mean = [v / self.block - self.base[i] for i, v in enumerate(self.gyro_sum)]
+        self.rate = sum((mean[i] * self.gyro - self.b[i]) ** 2 for i in range(3))
+        for i in range(3):
+            self.pair_sum[i] += self.gyro_sum[i]
+        if self.part_end > LEVELLING:
+            self.mean = [v / self.block / 2 - self.base[i] for i, v in enumerate(self.pair_sum)]
+            self.sample = [*counts[0:3], *(counts[3 + i] - self.base[i] for i in range(3))]
+            self.pair_sum = [0] * 3
         self.force_sum, self.gyro_sum = [0.0] * 3, [0] * 3
-        self.sample = [*counts[0:3], *(counts[3 + i] - self.base[i] for i in range(3))]
-        self.rate = sum((self.mean[i] * self.gyro - self.b[i]) ** 2 for i in range(3))
+        self.n += 1
+        self.k = min(0.5, max(self.k_pace, 1 / (self.ramp * self.n + 1)))
+
+    def _pace(self):
+        """The gain after the start, for the next two blocks; the watch for a lost tilt."""
+        p, T = self.p, self.T2
         if self.rate > self.held:
             self.held = self.rate
         else:
@@ -362,7 +379,7 @@ class InertialFloat(EarthFloat):
             self.lean_s[i] += T / (LEAN_TAU + T) * (self.h[i] - self.lean_s[i])
         if self.decide(LEANS, math.hypot(*self.lean_s) > p["lost_g"]):
             self.lean += 1
-            if self.lean > self.whole(LEAN_AFTER):
+            if self.lean > self.pairs(LEAN_AFTER):
                 self.n = self.lean = 0
                 self.open_heading(OPEN)
         else:
@@ -374,8 +391,7 @@ class InertialFloat(EarthFloat):
             turns = math.sqrt(self.held) / math.radians(100)
             tau = p["tau_turning"] / math.sqrt(turns) if turns else p["tau_slow"]
             tau = min(p["tau_slow"], max(p["tau_fast"], tau))
-        self.n += 1
-        self.k = min(0.5, max(T / tau, 1 / (self.ramp * self.n + 1)))
+        self.k_pace = self.T / tau
 
     def _level(self):
         h, s, k = self.h, self.s, self.k
@@ -658,34 +674,38 @@ class InertialFloat(EarthFloat):
         P[0][0] = x
         self.doubt = math.sqrt(x)
 
-    def _take(self, row, value, noise, errors=4):
-        """The measurement value = row . x of this variance, into the first so many errors: 4, 1 the heading alone."""
+    def _take(self, row, value, noise, share=1.0, keep=False):
+        """The measurement value = row . x, of this variance.
+
+        The biases' gain is `share` of the optimal one, and P what that leaves (Joseph's form); keep: P stays.
+        """
         P, dx = self.P, self.dx
         z = [sum(P[i][k] * row[k] for k in range(4)) for i in range(4)]
         total = max(0.0, sum(z[i] * row[i] for i in range(4))) + noise
         value -= sum(dx[i] * row[i] for i in range(4))
-        unit = math.sqrt(2) * self.bias_start
-        for i in range(errors):
-            dx[i] = clamp(dx[i] + z[i] * value / total, 4 * (unit if i else 2.5))
+        for i in range(4):
+            part = share if i else 1.0
+            unit = self.unit if i else 2.5
+            dx[i] = clamp(dx[i] + part * z[i] * value / total, 4 * unit)
+            if keep:
+                continue
             for k in range(i, 4):
-                P[i][k] -= z[i] * z[k] / total
+                P[i][k] -= part * (2 - part) * z[i] * z[k] / total
                 P[k][i] = P[i][k]
-            P[i][i] = max(P[i][i], LEAST * (unit if i else 2.5) ** 2)
+            P[i][i] = max(P[i][i], LEAST * unit**2)
 
-    def _measure_heading(self, alone):
+    def _measure_heading(self):
         if not (self.j and self.weight):
             return
+        late = self.n > self.whole(self.p["bias_after"])
+        most = LIMIT + LIMIT_DOUBT * self.doubt
         noise = self.p["mag_noise"] ** 2 / (self.j * self.T2)
-        if self.n > self.whole(self.p["bias_after"]):
-            noise *= SPLIT / (SPLIT - 1) if alone else SPLIT
-        elif not alone:
-            return
-        e = clamp(self.e, LIMIT + LIMIT_DOUBT * self.doubt)
-        self._take([1, 0, 0, 0], e, noise, 1 if alone else 4)
+        share = SHARE if late else 0.0
+        self._take([1, 0, 0, 0], clamp(self.e, most), noise, share, keep=abs(self.e) > most)
 
     def _measure_bias(self):
         """At rest the gyro's axes in turn, in motion the tilt correction north and west."""
-        p, unit = self.p, math.sqrt(2) * self.bias_start
+        p, unit = self.p, self.unit
         self.axis = (self.axis + 1) % 3
         if self.rest:
             i = self.axis
