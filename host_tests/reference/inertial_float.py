@@ -80,7 +80,7 @@ DEFAULTS = {
     "bias_full": 7.0,
     "bias_limit_dps": 25.0,
     "bias_start_dps": 4.0,
-    "bias_walk": 0.0005,
+    "bias_walk": 0.003,
     "bias_walk_level": 0.05,
     "tilt_noise": 3.5,
     "rest_noise": 0.05,
@@ -104,7 +104,7 @@ DEFAULTS = {
     "outage": 0.5,
 }
 BLOCKS_HZ = 23
-PARTS, LEVELLING = 9, 2  # parts of the work of a block; of every other block there are but these
+PARTS = 8  # of the work of two blocks
 TURN_MOST = 0.5  # rad a block: each part of a correction
 LEAN_TAU, LEAN_AFTER = 0.5, 2.0  # s
 FULL_MOST = 10  # samples with a gyro at full scale, after which the tilt starts again
@@ -113,7 +113,7 @@ SOON = 0.3  # s
 JUMP_DPS = 1.0
 WAIT_FIELD, WAIT_SURE = 60.0, 30.0  # s
 WAIT_MOVED_G = 0.03
-TURN_SURE, TURN_LEAST = 0.1, 0.02  # rad
+TURN_SURE, TURN_LEAST = 0.06, 0.02  # rad
 FIELD_SMOOTH = 0.05  # s
 SAME_TOLERANCE = 0.08
 FOR_MOST, NEED, NEED_MOST, BACK_AFTER, STEADY_MOST = 60.0, 5.0, 125.0, 3.0, 1.0  # s
@@ -200,7 +200,7 @@ class InertialFloat(EarthFloat):
         self.base = [0.0] * 3
         self.R = rows([1.0, 0.0, 0.0, 0.0])
         self.P = [[0.0] * 4 for _ in range(4)]
-        self.phase, self.axis, self.side = 1, 0, 0
+        self.axis = self.side = 0
         self.gyro_sum, self.pair_sum = [0] * 3, [0] * 3
         self.held = 0.0
         self.blocks = self.still = 0  # of the rest detector
@@ -214,9 +214,8 @@ class InertialFloat(EarthFloat):
         self.set_bias([0.0] * 3)
         self.set_quaternion([1.0, 0.0, 0.0, 0.0])
 
-    def whole(self, seconds):
-        """Blocks."""
-        return int(seconds / self.T + 0.5)
+    def steps(self, seconds):
+        return int(seconds / self.dt + 0.5)
 
     def pairs(self, seconds):
         return int(seconds / self.T2 + 0.5)
@@ -248,7 +247,9 @@ class InertialFloat(EarthFloat):
         self.n = self.lean = 0
         self.pair_sum = [0] * 3
         self.k_pace = self.T / self.p["tau_start"]
-        self.part = self.part_end = 0
+        self.again = False
+        self.part, self.phase = PARTS, 1
+        self.level, self.regress = 1, False
         self.s, self.lean_s = [0.0, 0.0, 1.0], [0.0, 0.0]
         self.off = [0.0, 0.0]
         self.c = [0.0, 0.0]  # tilt correction of this block, rad
@@ -300,8 +301,8 @@ class InertialFloat(EarthFloat):
             self.gap += 1
             return
         self.forced = decisions
-        if self.gap >= max(1, int(self.p["outage"] / dt + 0.5)):
-            self.n = 0
+        if self.gap >= max(1, self.steps(self.p["outage"])):
+            self.again = True
             self.open_heading(OPEN)
         self.gap = 0
         if counts[10] & 8:
@@ -309,7 +310,7 @@ class InertialFloat(EarthFloat):
             self.full += 1
         else:
             if self.full >= FULL_MOST:
-                self.n = 0
+                self.again = True
             self.full = 0
         R = self.R = rows(self.q)
         a = counts[0:3]
@@ -317,56 +318,68 @@ class InertialFloat(EarthFloat):
             self.force_sum[i] += (R[i][0] * a[0] + R[i][1] * a[1] + R[i][2] * a[2]) / self.lsb
             self.gyro_sum[i] += counts[3 + i]
         self.gather(counts)
-        if self.phase % self.block == 0:
-            self.part, self.part_end = 0, LEVELLING if self.phase else PARTS
-        self.phase = (self.phase + 1) % (2 * self.block)
+        phase = self.phase
+        self.phase = (phase + 1) % (2 * self.block)
+        if phase == 0:
+            self.part = 0
+        if phase % self.level == 0:
+            self._close(counts, phase)
+            self._level()
+            self.regress = True
+        if self.regress and (phase % self.level or self.level == 1):
+            self._regress()
+            self.regress = False
         for _ in range(self.pace):
-            if self.part < self.part_end:
-                self._work(counts)
+            if self.part < PARTS:
+                self._work()
                 self.part += 1
 
-    def _work(self, counts):
+    def _work(self):
         part = self.part
-        if part == 0:
-            self._close(counts)
-            self._level()
-        elif part == 1:
-            self._regress()
-        elif part == 2:
+        if part == 1:
             self._pace()
             self._rest()
-        elif part == 3:
+        elif part == 2:
             if self.axes == 9:
                 self._compass()
             else:
                 self.part += 1
-        elif part == 4 and self.j:
+        elif part == 3 and self.j:
             self._smooth_field()
             self._judge_field()
-        elif part == 5:
+        elif part == 4:
             self._grow()
-        elif part == 6:
+        elif part == 5:
             self._measure_heading()
-        elif part == 7:
+        elif part == 6:
             self._measure_bias()
-        elif part == 8:
+        elif part == 7:
             self._apply()
 
     # -- levelling
-    def _close(self, counts):
-        """The end of a block: its means; the gain k of this block."""
-        self.h = [v / self.block for v in self.force_sum]
-        mean = [v / self.block - self.base[i] for i, v in enumerate(self.gyro_sum)]
+    def _close(self, counts, phase):
+        """The end of a levelling: its means; its gain k."""
+        steps = self.level
+        self.h = [v / steps for v in self.force_sum]
+        mean = [v / steps - self.base[i] for i, v in enumerate(self.gyro_sum)]
         self.rate = sum((mean[i] * self.gyro - self.b[i]) ** 2 for i in range(3))
         for i in range(3):
             self.pair_sum[i] += self.gyro_sum[i]
-        if self.part_end > LEVELLING:
+        if phase == 0:
             self.mean = [v / self.block / 2 - self.base[i] for i, v in enumerate(self.pair_sum)]
             self.sample = [*counts[0:3], *(counts[3 + i] - self.base[i] for i in range(3))]
             self.pair_sum = [0] * 3
         self.force_sum, self.gyro_sum = [0.0] * 3, [0] * 3
-        self.n += 1
-        self.k = min(0.5, max(self.k_pace, 1 / (self.ramp * self.n + 1)))
+        if self.again:
+            self.again = False
+            self.n, steps = 0, 1
+            self.level = 1
+        k = self.k_pace * steps / self.block
+        self.n += steps
+        self.k = min(0.5, max(k, steps / (self.ramp * self.n // 1 + steps)))
+        # it takes no more than an eighth of the time since the start
+        if steps < self.block and self.n // 16 >= steps and phase % (2 * steps) == 0:
+            self.level = 2 * steps
 
     def _pace(self):
         """The gain after the start, for the next two blocks; the watch for a lost tilt."""
@@ -380,7 +393,7 @@ class InertialFloat(EarthFloat):
         if self.decide(LEANS, math.hypot(*self.lean_s) > p["lost_g"]):
             self.lean += 1
             if self.lean > self.pairs(LEAN_AFTER):
-                self.n = self.lean = 0
+                self.again, self.lean = True, 0
                 self.open_heading(OPEN)
         else:
             self.lean = max(0, self.lean - 2)
@@ -442,13 +455,12 @@ class InertialFloat(EarthFloat):
             jumped = max(abs(v) for v in off) > math.radians(JUMP_DPS)
             jumped = jumped and self.P[1][1] > self.bias_start**2 / 5
             jumped = self.decide(JUMPED, self.still < n and jumped)
-            if jumped:
-                self.n = 0
             upset = math.hypot(*self.s[0:2]) > p["upset_g"]
-            upset = self.decide(UPSET, self.n > self.whole(SOON) and upset)
+            upset = self.decide(UPSET, self.n > self.steps(SOON) and upset)
             if upset:
-                self.n = n = 0
+                n = 0
             if jumped or upset:
+                self.again = True
                 self.open_heading(OPEN)
         self.still = n
 
@@ -674,10 +686,10 @@ class InertialFloat(EarthFloat):
         P[0][0] = x
         self.doubt = math.sqrt(x)
 
-    def _take(self, row, value, noise, share=1.0, keep=False):
+    def _take(self, row, value, noise, share=1.0):
         """The measurement value = row . x, of this variance.
 
-        The biases' gain is `share` of the optimal one, and P what that leaves (Joseph's form); keep: P stays.
+        The biases' gain is `share` of the optimal one, and P what that leaves (Joseph's form).
         """
         P, dx = self.P, self.dx
         z = [sum(P[i][k] * row[k] for k in range(4)) for i in range(4)]
@@ -687,8 +699,6 @@ class InertialFloat(EarthFloat):
             part = share if i else 1.0
             unit = self.unit if i else 2.5
             dx[i] = clamp(dx[i] + part * z[i] * value / total, 4 * unit)
-            if keep:
-                continue
             for k in range(i, 4):
                 P[i][k] -= part * (2 - part) * z[i] * z[k] / total
                 P[k][i] = P[i][k]
@@ -697,11 +707,10 @@ class InertialFloat(EarthFloat):
     def _measure_heading(self):
         if not (self.j and self.weight):
             return
-        late = self.n > self.whole(self.p["bias_after"])
-        most = LIMIT + LIMIT_DOUBT * self.doubt
         noise = self.p["mag_noise"] ** 2 / (self.j * self.T2)
-        share = SHARE if late else 0.0
-        self._take([1, 0, 0, 0], clamp(self.e, most), noise, share, keep=abs(self.e) > most)
+        noise *= max(1.0, abs(self.e) / (LIMIT + LIMIT_DOUBT * self.doubt))
+        late = self.n > self.steps(self.p["bias_after"])
+        self._take([1, 0, 0, 0], self.e, noise, SHARE if late else 0.0)
 
     def _measure_bias(self):
         """At rest the gyro's axes in turn, in motion the tilt correction north and west."""
@@ -714,7 +723,7 @@ class InertialFloat(EarthFloat):
             off = self.low2[3 + i] * self.gyro - self.b[i]
             self._take(row, clamp(off, 4 * unit), self.rest_noise / self.T2 / 3)
             return
-        late, full = self.whole(p["bias_after"]), self.whole(p["bias_full"])
+        late, full = self.steps(p["bias_after"]), self.steps(p["bias_full"])
         full = max(late + 1, full)
         if self.n <= late:
             return
