@@ -5,10 +5,10 @@ units, true roots and angles, and no rounding. Yes/no decisions are taken here, 
 (`update(counts, decisions)`), so that a comparison measures arithmetic alone.
 """
 
-# The model. dt: one step; T: one block of 2**n steps, 44 to 88 ms (4 steps at least); T2: two blocks. q turns the body
-# into the earth; R: its matrix, whose rows are north, west and up as the body sees them; g: acceleration of gravity.
+# The model. dt: one step; T: a block of 2**n steps, 44 to 88 ms (4 steps at least); T2: two blocks. q turns the body
+# into the earth; R: its matrix, whose rows are north, west and up as the body sees them.
 #
-# Every step, w the gyro's rate less the bias that was set and the learnt one b:
+# Every step, with w the gyro's rate less the bias that was set and the learnt one, b:
 #     d = w dt;  q turns by d + d_before x d / 12 + R' turn
 # The product is the coning term. `turn` is the last correction (earth frame): the next fresh step takes it up.
 #
@@ -18,25 +18,28 @@ units, true roots and angles, and no rounding. Yes/no decisions are taken here, 
 # counts as 1 g at most; upside down, (s_north, s_west) counts as if it were 1.4 g long.
 #     tau = tau_turning (100 deg/s / |w|)**(1/2), between tau_fast and tau_slow
 # |w| is held: it follows up at once, and down slowly. tau = tau_start while a bias is known worse than to bias_start /
-# 125**(1/2). After a (re)start, N blocks ago, k is at least 1 / (ramp_tilt N + 1), and never more than 1/2.
+# 125**(1/2). In the time t after a start k is no less than L / (ramp_tilt t + L), and never more than 1/2; L is what a
+# levelling takes: one step at first, then never more than t / 8 until it is T.
 # The tilt is lost, and starts again, when |h| (horizontal, low-passed over 0.5 s) is above lost_g for 2 s.
 #
 # What follows is done every two blocks.
 #
-# Rest: gyro and accelerometer are near their two-pole low-passes for rest_after.
+# Rest: gyro and accelerometer have been near their two-pole low-passes for rest_after.
 #
-# The error is estimated by a Kalman filter of four states, x = (heading, bias) with covariance P. The gyro turns the
-# heading away by what is wrong with the bias about the vertical (u = third row of R):
+# A Kalman filter estimates the error of four states, x = (heading, bias), with covariance P. The gyro turns the heading
+# away by what is wrong with the bias about the vertical (u = third row of R):
 #     heading' = -u . bias + noise of (0.0006 rad)**2 + (scale_error |w|)**2 a second
 #     bias'    = noise of bias_walk**2 along u, bias_walk_level**2 across it, a second
-# It is measured, each value having the variance that is given here over the seconds of its block:
-#     compass       e = atan2(-west, north) of the block's mean field: the heading, mag_noise**2
+# What is measured, with the variance that its mean over one second would have:
+#     compass       e = atan2(-west, north) of the mean field: the heading, mag_noise**2
 #     tilt, moving  -(turn_north, turn_west) / T = (y_north, y_west) . bias, tilt_noise**2 (1 + D)
 #     rest          low-passed gyro - b: the bias, rest_noise**2
 # y_north and y_west are the first two rows of R, low-passed as the tilt is; D is the low-pass of |h - s|**2 /
-# accel_doubt_g**2. The compass's innovation is bounded by 0.02 rad + 0.7 doubt, doubt**2 = P(heading); P stays as it
-# is when it was. What is wrong with a field lasts, and is no noise: so of the gain by which the compass corrects the
-# biases only 0.22 is taken, and P is what that leaves: P - (K z' + z K' - K S K'), z = P row', S = row z + variance.
+# accel_doubt_g**2. They take turns, one in two blocks; at rest the three axes of the gyro do.
+# Beyond 0.02 rad + 0.7 doubt, doubt**2 = P(heading), the compass's variance grows with |e|: a larger error pulls no
+# harder (P. J. Huber, Ann. Math. Stat. 35(1), 1964). What is wrong with a field lasts, and is no noise: so of the gain
+# K by which the compass corrects the biases only 0.22 is taken, and P is what that leaves: P - K z' - z K' + K S K',
+# with z = P row' and S = row z + variance.
 # After two blocks b takes up the bias's part of x, `turn` about up the heading's; the tilt is never touched.
 #
 # A start, a restart of the tilt, or a gyro at full scale make P(heading) larger again, as far as 3 rad**2; what
@@ -51,21 +54,18 @@ units, true roots and angles, and no rounding. Yes/no decisions are taken here, 
 
 import math
 
-# decisions, as lib/upright/inertial.py has them in its state
+from reference.earth_float import block_of, clamp, rows, turned, wrap
+from reference.earth_float import start as start  # for who starts the twin
+from reference.field_float import NEAR_REFERENCE, FieldFloat
+
+# decisions, as lib/upright/inertial.py has them in its state; the others are in field_float.py
 STILL = 1  # gyro and accelerometer near their averages, and the gyro below the largest bias
-NEAR_REFERENCE = 2  # field near the reference
-NEAR_CANDIDATE = 4  # field and heading near the candidate for a new reference
-TURNING = 8  # turning quickly enough to learn a field
-CONSISTENT = 16  # heading error no larger than what the gyro explains
 OVER = 32  # more than 90 degrees from level
-NEAR_OLD = 64  # field near the reference before, and nearer than to this one
 UPSET = 128  # a tilt error at rest that cannot be
 CONTRADICTS = 256  # a rest that contradicts a known bias
 ADOPT = 512  # it is believed
 TURNED = 1024  # it is none: the body turned, or moved
 LEANS = 2048  # a horizontal force that no tilt should leave
-SAME = 4096  # field still that of the reference
-FORGET = 8192  # so little is known of the heading that any field will do
 VAGUE = 16384  # little is known of a bias
 JUMPED = 32768  # a rest ends the tilting that an unknown bias did
 
@@ -74,7 +74,7 @@ DEFAULTS = {
     "tau_fast": 3.2,
     "tau_slow": 20.0,
     "tau_turning": 4.4,
-    "ramp_tilt": 0.7,
+    "ramp_tilt": 0.65,
     "accel_doubt_g": 0.16,
     "bias_after": 0.3,
     "bias_full": 7.0,
@@ -105,6 +105,7 @@ DEFAULTS = {
 }
 BLOCKS_HZ = 23
 PARTS = 8  # of the work of two blocks
+OFF_MOST = 15.625  # in accel_doubt_g
 TURN_MOST = 0.5  # rad a block: each part of a correction
 LEAN_TAU, LEAN_AFTER = 0.5, 2.0  # s
 FULL_MOST = 10  # samples with a gyro at full scale, after which the tilt starts again
@@ -114,67 +115,16 @@ JUMP_DPS = 1.0
 WAIT_FIELD, WAIT_SURE = 60.0, 30.0  # s
 WAIT_MOVED_G = 0.03
 TURN_SURE, TURN_LEAST = 0.06, 0.02  # rad
-FIELD_SMOOTH = 0.05  # s
-SAME_TOLERANCE = 0.08
-FOR_MOST, NEED, NEED_MOST, BACK_AFTER, STEADY_MOST = 60.0, 5.0, 125.0, 3.0, 1.0  # s
-STILL_TAU, STILL_E = 5.0, 0.1  # s, rad
-CANDIDATE_E = 0.35  # rad
-FORGOTTEN = 0.3  # rad**2
-OPEN, SIX = (
-    3.0,
-    2**-14 * 6.25,
-)  # rad**2: nothing is known of the heading; six axes: it is the start's
+OPEN, SIX = 3.0, 2**-14 * 6.25  # rad**2: nothing is known of the heading; six axes: the start's
 WALK = 0.0006  # rad per root s
 LIMIT, LIMIT_DOUBT = 0.02, 0.6875  # rad, 1
-GATE_DOUBT = 1.125
 SHARE = 0.22  # of the gain with which the heading corrects the biases
+STEP_MOST = 64  # a rest makes the variance of a bias no smaller than 1/65 at a time
 LEAST = 2.0**-24  # of a variance, in units of (2.5 rad)**2 or 2 bias_start**2
 NOISE_MOST, TILT_MOST = 512.0, 16.0  # of a measurement, in units of 2 bias_start**2
 
 
-def block_of(rate, blocks_hz=BLOCKS_HZ):
-    """Steps of a block: the least power of two, 4 or more, with which there are fewer than blocks_hz a second."""
-    block = 4
-    while rate / block >= blocks_hz:
-        block *= 2
-    return block
-
-
-def clamp(v, limit):
-    return limit if v > limit else -limit if v < -limit else v
-
-
-def wrap(angle):
-    return math.remainder(angle, 2 * math.pi)
-
-
-class EarthFloat:
-    """What both float twins do that average in the earth frame."""
-
-    def chosen(self, defaults, parameters):
-        unknown = set(parameters) - set(defaults)
-        if unknown:
-            raise TypeError(f"no parameter {min(unknown)!r}")
-        return defaults | parameters
-
-    def decide(self, bit, value):
-        if self.forced is not None:
-            taken = bool(self.forced & bit)
-            self.disagreed += taken != bool(value)
-            value = taken
-        self.decided = self.decided | bit if value else self.decided & ~bit
-        return bool(value)
-
-    def gather(self, counts):
-        """A fresh magnetometer sample into its sum in the earth frame."""
-        m = counts[6:9]
-        if self.axes == 9 and counts[10] & 2 and any(m) and max(abs(v) for v in m) < 32767:
-            for i, row in enumerate(self.R):
-                self.mag_sum[i] += row[0] * m[0] + row[1] * m[1] + row[2] * m[2]
-            self.mag_n += 1
-
-
-class InertialFloat(EarthFloat):
+class InertialFloat(FieldFloat):
     """The float twin of inertial.Inertial9, with 6 axes Inertial6.
 
     rate in Hz (float); gyro_scale LSB per deg/s and accel_lsb_per_g as floats; axes 6 or 9; any of DEFAULTS.
@@ -187,7 +137,7 @@ class InertialFloat(EarthFloat):
         p = self.chosen(DEFAULTS, parameters)
         self.p, self.axes = p, axes
         self.dt = 1 / rate
-        self.block = block_of(rate)
+        self.block = block_of(rate, BLOCKS_HZ)
         self.pace = max(1, -(-PARTS // self.block))
         self.T, self.T2 = self.block / rate, 2 * self.block / rate
         self.gyro = math.radians(1 / gyro_scale)
@@ -266,6 +216,7 @@ class InertialFloat(EarthFloat):
 
     def open_heading(self, variance):
         """The heading's variance is at least this from now on."""
+        variance = min(OPEN, variance)
         self.still_set = False
         if variance > self.P[0][0]:
             self.P[0] = [variance, 0.0, 0.0, 0.0]
@@ -426,7 +377,8 @@ class InertialFloat(EarthFloat):
         for i in range(6):
             self.x[i] += 2 * k * (v[i] - self.y[i] - self.x[i])
             self.y[i] += k * self.x[i]
-        off = sum(clamp(v, 3.0) ** 2 for v in self.off) / self.p["accel_doubt_g"] ** 2
+        off = [clamp(v, 3.0) / self.p["accel_doubt_g"] for v in self.off]
+        off = sum(clamp(v, OFF_MOST) ** 2 for v in off)
         self.d += 2 * k * (off - self.d)
         self.tilt_weight = 1 / (1 + self.d)
 
@@ -456,7 +408,8 @@ class InertialFloat(EarthFloat):
             jumped = jumped and self.P[1][1] > self.bias_start**2 / 5
             jumped = self.decide(JUMPED, self.still < n and jumped)
             upset = math.hypot(*self.s[0:2]) > p["upset_g"]
-            upset = self.decide(UPSET, self.n > self.steps(SOON) and upset)
+            upset = not jumped and self.n > self.steps(SOON) and upset
+            upset = self.decide(UPSET, upset)
             if upset:
                 n = 0
             if jumped or upset:
@@ -497,7 +450,7 @@ class InertialFloat(EarthFloat):
         turned = self.decide(TURNED, turned)
         if self.decide(ADOPT, adopt):
             self.open_bias()
-            self.open_heading(min(OPEN, (math.sqrt(self.P[0][0]) + turn) ** 2))
+            self.open_heading((math.sqrt(self.P[0][0]) + turn) ** 2)
             self.wait = 0
             return n
         if turned:
@@ -512,143 +465,6 @@ class InertialFloat(EarthFloat):
         """Blocks of rest that would give this variance."""
         most = max(1, self.pairs(self.p["rest_wait"]))
         return max(self.rest_after, min(most, int(self.rest_noise / self.T2 / variance)))
-
-    # -- magnetic field
-    def _compass(self):
-        """The heading error, and the pair (horizontal, vertical) field."""
-        self.since = min(16, self.since + 1)
-        self.j = 0
-        if not self.mag_n:
-            return
-        n, w, up = (v / self.mag_n for v in self.mag_sum)
-        self.mag_sum, self.mag_n = [0.0] * 3, 0
-        self.j, self.since = self.since, 0
-        self.e = math.atan2(-w, n)
-        self.now = math.hypot(n, w), up
-
-    def _smooth_field(self):
-        """The field smoothed, and what it is like."""
-        p, e, doubt = self.p, self.e, self.doubt
-        if self.field is None:
-            self.field, self.candidate, self.candidate_e = list(self.now), list(self.now), e
-        f, r = self.field, self.reference
-        t = self.j * self.T2
-        for i in range(2):
-            f[i] += t / (FIELD_SMOOTH + t) * (self.now[i] - f[i])
-
-        def away(r):
-            return math.hypot(f[0] - r[0], f[1] - r[1]) / math.hypot(*r) if r else math.inf
-
-        def distance(r):
-            return math.hypot(f[0] - r[0], f[1] - r[1])
-
-        near = r is not None and away(r) < p["field_tolerance"]
-        self.decide(NEAR_REFERENCE, near)
-        old = self.old is not None and away(self.old) < p["field_tolerance"]
-        self.decide(NEAR_OLD, old and not (near and distance(self.old) >= distance(r)))
-        self.decide(SAME, r is not None and away(r) < SAME_TOLERANCE)
-        self.decide(TURNING, self.rate >= math.radians(p["field_dps"]) ** 2)
-        consistent = abs(e) < p["field_gate"] + GATE_DOUBT * doubt
-        if r is not None and self.still_set and self.rest:
-            consistent = consistent and abs(wrap(e - self.still_e)) <= STILL_E
-        self.decide(CONSISTENT, consistent)
-        candidate = away(self.candidate) < p["field_tolerance"]
-        if r is not None and not self.good:
-            candidate = candidate and abs(wrap(e - self.candidate_e)) < CANDIDATE_E + doubt
-        self.decide(NEAR_CANDIDATE, candidate)
-        self.decide(FORGET, self.P[0][0] > FORGOTTEN)
-
-    def _judge_field(self):
-        """Whether the heading of this field is believed; whether another field takes the reference's place."""
-        p, j, e, f, has = self.p, self.j, self.e, self.field, self.decided
-        after = max(1, self.pairs(p["field_after"]))
-        good = False
-        near = 0
-        if has & NEAR_REFERENCE and has & CONSISTENT:
-            near = min(after, self.near + j)
-            good = near == after
-            if good and has & TURNING:
-                self.seen = min(self.pairs(FOR_MOST), self.seen + j)
-        if good or not has & NEAR_CANDIDATE:
-            self.candidate_for = 0
-        elif self.reference is None or has & (TURNING | FORGET):
-            self.candidate_for += j
-        k = min(1 / 16, j * self.T2 / (p["field_tau"] + j * self.T2))
-        for i in range(2):
-            if good:
-                self.reference[i] += k * (f[i] - self.reference[i])
-            if has & NEAR_CANDIDATE:
-                self.candidate[i] += k * (f[i] - self.candidate[i])
-            else:
-                self.candidate[i] = f[i]
-        if not has & NEAR_CANDIDATE or good or self.reference is None:
-            self.candidate_e = e
-        else:
-            self.candidate_e = wrap(self.candidate_e + k * wrap(e - self.candidate_e))
-        restart = self._own_error()
-        if restart:
-            near, good, self.candidate_for = after, True, 0
-        elif not good and near == 0:
-            taken = self._another_reference()
-            if taken:
-                near, good, self.candidate_for = after, True, 0
-                restart = taken == "restart"
-        self.near, self.good = near, good
-        if restart:
-            # the heading may be off by e, and the bias is what made it so
-            self.open_heading(min(OPEN, e * e))
-            self.open_bias()
-        self.weight = int(good or self.reference is None)
-        if self.weight:
-            if self.still_set and self.rest:
-                k = self.T2 / (STILL_TAU + self.T2)
-                self.still_e += k * wrap(e - self.still_e)
-            else:
-                self.still_set, self.still_e = True, e
-
-    def _own_error(self):
-        """The field is what it was, and its heading is another, for restart_after: the attitude is wrong."""
-        has, j, most = self.decided, self.j, max(1, self.pairs(STEADY_MOST))
-        self.steady = min(most, self.steady + j) if has & SAME else 0
-        if self.reference is None or has & CONSISTENT:
-            self.lost = max(0, self.lost - 2 * j)
-            self.own = self.steady == most
-        elif self.own and self.steady:
-            self.lost += 2 * j if has & TURNING else j
-            if self.lost > self.pairs(2 * self.p["restart_after"]):
-                self.lost = 0
-                return True
-        else:
-            self.lost, self.own = 0, False
-        return False
-
-    def _another_reference(self):
-        """The candidate becomes the reference -> True, "restart" where the heading is another's; False: it does not."""
-        p, has = self.p, self.decided
-        r = self.reference
-        need, n, returns = self.pairs(p["field_first"]), self.candidate_for, False
-        if r is not None:
-            if not has & FORGET:
-                need = min(self.pairs(NEED_MOST), 2 * self.seen + self.pairs(NEED))
-                if has & CONSISTENT:
-                    need = min(need, self.pairs(p["field_new"]))
-            if has & NEAR_OLD:
-                self.back += self.j
-                need = min(need, self.pairs(BACK_AFTER))
-                returns = self.back >= n
-                n = max(n, self.back)
-            else:
-                self.back = 0
-        if n < need:
-            return False
-        restart = r is not None and (not has & CONSISTENT or returns)
-        n = min(n, self.pairs(FOR_MOST))
-        if returns:
-            n = max(n, self.old_seen)
-        if r is not None and (restart or not has & NEAR_REFERENCE):
-            self.old, self.old_seen, self.back = r, self.seen, 0
-        self.reference, self.seen = list(self.candidate), n
-        return "restart" if restart else True
 
     # -- heading and bias
     def _grow(self):
@@ -721,7 +537,8 @@ class InertialFloat(EarthFloat):
             row = [0.0] * 4
             row[1 + i] = 1.0
             off = self.low2[3 + i] * self.gyro - self.b[i]
-            self._take(row, clamp(off, 4 * unit), self.rest_noise / self.T2 / 3)
+            noise = max(self.rest_noise / self.T2 / 3, self.P[1 + i][1 + i] / STEP_MOST)
+            self._take(row, clamp(off, 4 * unit), noise)
             return
         late, full = self.steps(p["bias_after"]), self.steps(p["bias_full"])
         full = max(late + 1, full)
@@ -745,45 +562,3 @@ class InertialFloat(EarthFloat):
         if abs(self.wait_turn + turn) < 2:
             self.wait_turn += turn
         self.still_e = wrap(self.still_e - turn)
-
-
-def turned(q, angle):
-    """q turned by the rotation vector `angle` (rad, body), normalised."""
-    x, y, z = angle
-    n = math.sqrt(x * x + y * y + z * z) / 2
-    c, s = math.cos(n), (math.sin(n) / n if n > 1e-9 else 1.0) / 2
-    x, y, z = x * s, y * s, z * s
-    a, b, d, e = q
-    r = (
-        a * c - b * x - d * y - e * z,
-        b * c + a * x + d * z - e * y,
-        d * c + a * y + e * x - b * z,
-        e * c + a * z + b * y - d * x,
-    )
-    n = math.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2] + r[3] * r[3])
-    return [v / n for v in r]
-
-
-def rows(q):
-    """The rotation matrix: rows are the earth's north, west and up in the body."""
-    w, x, y, z = q
-    return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-
-
-def start(counts, axes=9):
-    """The attitude of one accelerometer (and magnetometer, flags bit 1) sample; yaw 0 (order zyx) without one."""
-    x, y, z = counts[0:3]
-    roll, pitch = math.atan2(y, z), math.atan2(-x, math.hypot(y, z))
-    q = turned([math.cos(pitch / 2), 0.0, math.sin(pitch / 2), 0.0], [roll, 0, 0])
-    if axes == 9 and counts[10] & 2 and any(counts[6:9]):
-        R, m = rows(q), counts[6:9]
-        n, w = (r[0] * m[0] + r[1] * m[1] + r[2] * m[2] for r in R[:2])
-        yaw = math.atan2(-w, n) / 2
-        c, s = math.cos(yaw), math.sin(yaw)
-        a, b, d, e = q
-        q = [c * a - s * e, c * b - s * d, c * d + s * b, c * e + s * a]
-    return q

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from reference.inertial_float import EarthFloat, block_of, clamp, rows, turned
+from reference.earth_float import EarthFloat, block_of, clamp, rows, turned
 
 # decisions, as lib/upright/quaternion_kalman.py has them in its state
 STILL = 1  # gyro and accelerometer near their averages in this block
