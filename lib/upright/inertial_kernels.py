@@ -1132,7 +1132,7 @@ def measure_heading(s: ptr32) -> int:
     if x < 0:
         x = 0 - x
     if x > most:
-        s[_NOISE] = (s[_NOISE] >> 4) * ((x >> 12) // (most >> 16))
+        s[_NOISE] = (s[_NOISE] >> 5) * ((x >> 4) // (most >> 12)) >> 3
     s[_INNOVATION] = e // 5 - (s[_DX] << k >> k)  # units of 2.5 rad, Q27
     s[_Z] = s[_P]
     s[_Z + 1] = s[_P + 1]
@@ -1170,6 +1170,9 @@ def measure_bias(s: ptr32) -> int:
         s[_Z + 2] = s[_P + 8 + i]
         s[_Z + 3] = s[_P + 12 + i]
         s[_TOTAL] = s[_Z + i]
+        # P becomes no less than 1/65 at a time: 1 - Z / S is exact to 2**-14
+        if s[_NOISE] < s[_TOTAL] >> 16:
+            s[_NOISE] = s[_TOTAL] >> 16
         return 1
     if n <= s[_N_LATE]:
         return 0
