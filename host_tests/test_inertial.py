@@ -13,41 +13,40 @@ from histories import ONE, SCALE, SCALES, angles_between, follow, rows_of
 from reference import inertial_float
 from samples import counts, run
 from scenes import PACES, all_axes, errors, scene
-from upright.inertial import Inertial6, Inertial9, Inertial9Lite
+from upright.inertial import Inertial6, Inertial9
 from upright_host import paths, scoring, trials, words
 from upright_host.simulate import best_runtime as quickest
 
 LIB = paths.PACKAGE
 AT = words.places("inertial")
 APART_DEG = 0.1
+BIAS_APART_DPS = 0.01
 TOTAL_APART_DEG = 0.05
-
-
-def called(axes, lite=False):
-    return f"inertial{axes}" + ("-lite" if lite else "")
 
 
 @pytest.fixture
 def history(filter_history):
-    """history(rendered, axes, lite, mag_every, **options) -> History of all its rows, with `decided`."""
+    """history(rendered, axes, mag_every, **options) -> History of all its rows, with `decided`."""
 
-    def run(rendered, axes=9, lite=False, mag_every=1, runtime=None, **options):
+    def run(rendered, axes=9, mag_every=1, runtime=None, **options):
         options = {"mag_every": mag_every, "words": [AT.DECIDED]} | options
-        got = filter_history(runtime or quickest(), rendered, called(axes, lite), **options)
+        got = filter_history(runtime or quickest(), rendered, f"inertial{axes}", **options)
         got.decided = got.words[:, 0]
         return got
 
     return run
 
 
-def twin_history(rendered, decided, axes=9, lite=False, mag_every=1):
+def twin_history(rendered, decided, axes=9, mag_every=1, bias=(), **parameters):
     """The float twin with the decisions of the integer run: (attitudes (n, 4), the twin)."""
     rows = rows_of(rendered, mag_every)
     num, den = rendered.rate
     scale = rendered.gyro_scale[0] / rendered.gyro_scale[1]
     twin = inertial_float.InertialFloat(
-        num / den, scale, rendered.accel_lsb_per_g, axes=axes, lite=lite
+        num / den, scale, rendered.accel_lsb_per_g, axes=axes, **parameters
     )
+    if bias:
+        twin.set_bias([v / 256 for v in bias[:3]], *bias[3:])
     twin.set_quaternion(inertial_float.start(rows[0], axes))
     return follow(twin, rows, decided), twin
 
@@ -57,13 +56,66 @@ def twin_history(rendered, decided, axes=9, lite=False, mag_every=1):
 @pytest.mark.parametrize("rate, seconds, mag_every", [(100, 30, 1), (200, 20, 3), (1000, 6, 10)])
 def test_never_a_tenth_of_a_degree_from_the_float_twin(history, name, rate, seconds, mag_every):
     rendered = motions.render(name, rate=(rate, 1), seconds=seconds, accel_range_g=16)
-    for axes, lite in ((9, False), (6, False), (9, True)):
-        got = history(rendered, axes, lite, mag_every)
-        q, twin = twin_history(rendered, got.decided.tolist(), axes, lite, mag_every)
+    for axes in (9, 6):
+        got = history(rendered, axes, mag_every)
+        q, twin = twin_history(rendered, got.decided.tolist(), axes, mag_every)
         worst = angles_between(got.q, q).max()
-        print(f"{name} {rate} Hz {axes} axes lite {lite}: {worst:.5f} deg")
+        print(f"{name} {rate} Hz {axes} axes: {worst:.5f} deg, {twin.disagreed} otherwise")
         assert worst < APART_DEG
         assert twin.disagreed <= 3
+
+
+def spin(t):
+    return np.outer((t > 8) & (t < 8.7), (0, 3000.0, 0)) + all_axes(t) * (t > 12)[:, None]
+
+
+def magnet(since, until):
+    return lambda t: np.outer((t > since) & (t < until), (-30, 25, 0))
+
+
+def yaw(since, until, dps):
+    return lambda t: np.outer((t >= since) & (t < until), (0, 0, dps))
+
+
+# what happens: (scene, how it starts); all together they take every decision
+EVENTS = {
+    "turned by hand, then laid down": ({"body_rate": yaw(0, 3, 4.0), "seconds": 60}, {}),
+    "a turntable after a rest": ({"body_rate": yaw(20, 70, 2.0), "seconds": 70}, {}),
+    "a gyro at full scale": ({"body_rate": spin, "seconds": 25}, {}),
+    "a magnet for 8 s": ({"body_rate": all_axes, "field": magnet(12, 20), "seconds": 40}, {}),
+    "a magnet for 40 s": ({"body_rate": all_axes, "field": magnet(8, 48), "seconds": 60}, {}),
+    "tipped at rest": ({"kick": (10, (25, 10, 30)), "seconds": 20}, {}),
+    "knocked over at rest": ({"kick": (10, (60, 40, 30)), "seconds": 30}, {}),
+    "turned over in motion": (
+        {"kick": (10, (150, 40, 30)), "body_rate": all_axes, "seconds": 40},
+        {},
+    ),
+    "turned unseen": ({"kick": (10, (0, 0, 60)), "body_rate": all_axes, "seconds": 60}, {}),
+    "a large bias": ({"bias_dps": (20, -20, 20), "seconds": 10}, {}),
+    "a bias that is known": (
+        {"body_rate": all_axes, "seconds": 20},
+        {"bias": [5038, -3359, 2519, 100]},
+    ),
+}
+DECISIONS = 16
+
+
+def test_as_the_float_twin_through_all_that_happens(history):
+    """The bias, too; and each decision is taken both ways."""
+    taken, left = 0, 0
+    for event, (told, start) in EVENTS.items():
+        rendered = scene(100, **told)
+        got = history(rendered, **start)
+        q, twin = twin_history(rendered, got.decided.tolist(), **start)
+        worst = angles_between(got.q, q).max()
+        apart = np.abs(got.bias_dps[-1] - np.array(twin.base) / 16.4 - np.degrees(twin.b)).max()
+        print(f"{event}: {worst:.5f} deg, bias {apart:.5f} deg/s, {twin.disagreed} otherwise")
+        assert worst < APART_DEG, event
+        assert apart < BIAS_APART_DPS, event
+        assert twin.disagreed <= 3, event
+        taken |= int(np.bitwise_or.reduce(got.decided))
+        left |= ~int(np.bitwise_and.reduce(got.decided))
+    assert [bit for bit in range(DECISIONS) if not taken & left >> bit & 1] == []
 
 
 # what a run through chips may lose stays below what is asked of the project
