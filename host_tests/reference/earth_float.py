@@ -42,7 +42,8 @@ class EarthFloat:
     def gather(self, counts):
         """A fresh magnetometer sample into its sum in the earth frame."""
         m = counts[6:9]
-        if self.axes == 9 and counts[10] & 2 and any(m) and max(abs(v) for v in m) < 32767:
+        wanted = self.axes == 9 and counts[10] & 2 and self.mag_n < 64
+        if wanted and any(m) and max(abs(v) for v in m) < 32767:
             for i, row in enumerate(self.R):
                 self.mag_sum[i] += row[0] * m[0] + row[1] * m[1] + row[2] * m[2]
             self.mag_n += 1

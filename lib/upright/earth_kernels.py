@@ -108,7 +108,7 @@ def to_earth(s: ptr32, counts: ptr16):
     s[_R + 7] = n
     s[_R + 8] = o
     s[_FS + 2] = s[_FS + 2] + (m * x + n * y + o * z + 32 >> 6)
-    if counts[10] & 2 == 0 or s[_NINE] == 0:
+    if counts[10] & 2 == 0 or s[_NINE] == 0 or s[_MN] > 63:  # MS holds 64
         return
     # MS += R mag
     x = ((counts[6] & 0xFFFF) ^ 0x8000) - 0x8000

@@ -359,6 +359,8 @@ def pace(state):
     if s[_P + 5] <= s[_P_VAGUE] and s[_P + 10] <= s[_P_VAGUE] and s[_P + 15] <= s[_P_VAGUE]:
         decided ^= _VAGUE
         x = int(root(s[_HELD]))
+        if x > 16383:
+            x = 16383
         x = int(root(x << 16)) * s[_K_TURN] >> 10
         if x > s[_K_MOST]:
             x = s[_K_MOST]
