@@ -17,6 +17,7 @@ from chips.mpu_clone import MPU6050Clone
 from conftest import ROOT
 from upright import ahrs, calibration, timing
 from upright.auxiliary_bus import AuxiliaryBus
+from upright.inertial import Inertial6
 from upright.ist8310 import IST8310
 from upright.mpu6050 import MPU6050
 from upright.mpu6500 import MPU6500
@@ -673,6 +674,32 @@ def test_a_stored_bias_is_taken_and_counts_as_known():
     imu.stop()
     again = upright.AHRS(MPU6050(bus()), calibration=None, measure_bias=False, log=None).start()
     assert not again.status()["bias_known"]
+
+
+def test_the_filter_is_told_how_well_the_bias_is_known(monkeypatch):
+    """Measured, as after 100 s of rest; stored, as after 10; levelled at rest, as measured."""
+    known = []  # a filter that is made, or whose time is measured, has none
+    whole = Inertial6.set_bias
+
+    def set_bias(filter, x, y, z, known_s=0):
+        if known_s or x or y or z:
+            known.append(known_s)
+        whole(filter, x, y, z, known_s)
+
+    monkeypatch.setattr(Inertial6, "set_bias", set_bias)
+    imu, _ = start((0, 0, G, 8, 0, -4), measure_bias=True)
+    assert known == [100]
+    run(3)
+    imu.level()
+    assert imu.status()["at_rest"]
+    assert known == [100, 100]
+    imu.stop()
+    calibration.write(
+        "upright_cal.json", calibration.blank() | {"gyro_bias_udps": [500000, 0, -250000]}
+    )
+    known.clear()
+    start((0, 0, G, 8, 0, -4))
+    assert known == [10]
 
 
 def test_without_a_display_there_is_nothing_to_refresh():

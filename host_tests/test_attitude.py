@@ -90,12 +90,22 @@ def test_an_accelerometer_scale_that_cannot_be_is_refused(name, lsb):
         filters.make(name, 200, Other, {})
 
 
-@pytest.mark.parametrize("known_s", [0, 1, 2.5, 3600])
-def test_how_well_a_bias_is_known_changes_nothing_yet(made, known_s):
+@pytest.mark.parametrize("known_s", [0.01, 1, 2.5, 100, 3600])
+def test_how_well_a_bias_is_known_changes_the_inertial_filter_and_no_other(made, known_s):
     made.set_bias(100, -200, 300)
     before = list(made.state)
     made.set_bias(100, -200, 300, known_s=known_s)
-    assert list(made.state) == before
+    if not made.NAME.startswith("inertial"):
+        assert list(made.state) == before
+        return
+    at = words.places("inertial")
+    variances = [made.state[at.P + 5 * i] for i in (1, 2, 3)]
+    # 0.5 deg/s / known_s**0.5, in units of 2 * bias_start_dps**2; at most 1/2, at least 2**-24
+    start = made.PARAMETERS["bias_start_dps"][0]
+    expected = min(1 / 2, max(2**-24, 0.25 / known_s / (2 * start**2)))
+    assert [v / 2**30 for v in variances] == pytest.approx([expected] * 3, rel=1e-3)
+    others = [v for i, v in enumerate(made.state[at.P : at.P + 16]) if i % 5]
+    assert not any(others)
 
 
 @pytest.mark.parametrize("known_s", [-1, 3601, float("nan"), "1", None])
@@ -373,7 +383,7 @@ def test_an_accelerometer_that_cannot_be_used_is_not_and_one_that_can_is(name, w
 
 # -- the same bits everywhere, and the same as ever
 STATES = {"mahony6": "mahony", "mahony9": "mahony", "euler6": "euler", "kalman6": "kalman"}
-STATES |= dict.fromkeys(("inertial6", "inertial9", "inertial9-lite"), "inertial")
+STATES |= dict.fromkeys(("inertial6", "inertial9"), "inertial")
 STATES |= dict.fromkeys(("quaternion-kalman6", "quaternion-kalman9"), "quaternion_kalman")
 # what switches on more than the defaults do
 GAINS = {

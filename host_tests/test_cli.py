@@ -255,7 +255,7 @@ def test_the_demo_takes_the_board_that_a_filter_needs_and_refuses_an_unknown_one
     done = upright("demo", "--board", "abacus")
     assert done.exit_code == 2
     assert "robomaster_a" in done.output
-    assert replay.board_for("inertial9-lite") == "robomaster_a"
+    assert replay.board_for("quaternion-kalman9") == "robomaster_a"
     assert replay.board_for("inertial6") == "sim"
 
 

@@ -46,7 +46,7 @@ MADE = (
     ("inertial6", 200, COARSE, {}),
     ("inertial9", 1000, COARSE, {"bias_limit_dps": 25}),
     ("inertial9", 100, FINE, {}),
-    ("inertial9-lite", (2000, 7), Sensor((82, 5), 2048), {}),
+    ("inertial9", (2000, 7), Sensor((82, 5), 2048), {}),
     ("quaternion-kalman6", 200, COARSE, {}),
     ("quaternion-kalman9", 1000, COARSE, {"bias_start": 10}),
     ("quaternion-kalman9", 100, FINE, {}),

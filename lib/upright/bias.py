@@ -21,6 +21,11 @@ _REST_WINDOW_MS = const(1000)
 _REST_TRIES = const(4)
 _REST_READS_HZ = const(200)  # at least, with the slowest bus
 
+# How well a bias is known, in seconds of rest: one that was measured just now, and one of another day, when the chip was
+# colder or warmer.
+_MEASURED_S = const(100)
+_STORED_S = const(10)
+
 
 class Bias:
     """The gyro's bias of an AHRS's filter. known: it was measured, stored, or learnt."""
@@ -51,7 +56,7 @@ class Bias:
         bias = ahrs.calibration.gyro_bias()
         if bias is None:
             return False
-        ahrs.filter.set_bias(*bias)  # of another day: not known as a measured one is
+        ahrs.filter.set_bias(*bias, _STORED_S)
         self.known = True
         ahrs.log("bias: from", ahrs.settings.CALIBRATION)
         return True
@@ -136,7 +141,7 @@ class Bias:
                 and max(abs(m) for m in mean) <= 256 * bias_most
                 and self._is_gravity([t // n for t in total[:3]])
             ):
-                ahrs.filter.set_bias(*mean, _REST_WINDOW_MS / 1000)
+                ahrs.filter.set_bias(*mean, _MEASURED_S)
                 ahrs.log("bias: %s mdeg/s" % ([m * 1000 * den // (256 * num) for m in mean],))
                 return True
             if k + 1 < tries:

@@ -4,15 +4,18 @@ import gc
 
 # name: (module, class); a module is imported when one of its filters is made, so the others take no memory
 FILTERS = {
-    "mahony6": ("mahony", "Mahony6"),
-    "mahony9": ("mahony", "Mahony9"),
+    # the default: the answer for a user
     "inertial6": ("inertial", "Inertial6"),
     "inertial9": ("inertial", "Inertial9"),
-    "inertial9-lite": ("inertial", "Inertial9Lite"),
+    # the classic, small and quick
+    "mahony6": ("mahony", "Mahony6"),
+    "mahony9": ("mahony", "Mahony9"),
+    # to study and compare
     "euler6": ("complementary", "Euler6"),
     "kalman6": ("kalman", "Kalman6"),
     "quaternion-kalman6": ("quaternion_kalman", "QuaternionKalman6"),
     "quaternion-kalman9": ("quaternion_kalman", "QuaternionKalman9"),
+    # in the sensor
     "dmp6": ("dmp", "MpuDmp"),
 }
 

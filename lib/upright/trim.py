@@ -22,7 +22,8 @@ def level(filter, calibration):
     # the bias, from the old body frame into the new one
     v = _turned(_turn_of(before, -1), [bias[i] for i in range(3)])
     v = _turned(_turn_of(after, 1), v)
-    filter.set_bias(*[round(b) for b in v])
+    # at rest it is as good as measured
+    filter.set_bias(*[round(b) for b in v], 100 if getattr(filter, "resting", False) else 0)
 
 
 def _turn_of(up, sign):

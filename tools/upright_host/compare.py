@@ -233,7 +233,9 @@ def register(app: typer.Typer) -> None:
     def compare_command(
         where: list[Path] = typer.Argument(..., help="Trials (.npz), or folders of them."),
         filters: str = typer.Option(
-            None, help="Filters, with commas between (default: all); baselines may be among them."
+            None,
+            help="Filters, with commas between (default: all); baselines may be among them. "
+            + registry.CHOICE,
         ),
         runtime: str = options.runtime(board=True),
         baselines: bool = score.BASELINES_OPTION,

@@ -6,6 +6,13 @@ from upright_host import library
 from upright_host.console import Wrong
 
 
+# for the help texts of the commands that take a filter's name
+CHOICE = (
+    "For use: inertial6, inertial9. The classic: mahony6, mahony9. To study and compare: euler6, "
+    "kalman6, quaternion-kalman6, quaternion-kalman9."
+)
+
+
 def filters() -> dict[str, tuple[str, str]]:
     """name: (module, class) of lib/upright."""
     return library.upright("filters").FILTERS

@@ -33,7 +33,7 @@ from upright_host import (
 )
 from upright_host.console import Failed, Wrong
 
-FILTERS = "mahony6,mahony9,inertial6,inertial9,inertial9-lite"
+FILTERS = "inertial6,inertial9,mahony6,mahony9"
 COLUMNS = (
     *("trial", "filter", "heading_measure", "inclination", "heading", "total", "max_inclination"),
     *("heading_as_given", "total_as_given", "heading_best", "total_best", "offset"),
@@ -458,7 +458,7 @@ def register(app: typer.Typer) -> None:
             FILTERS,
             show_default=False,
             help="Filters, with commas between; baselines may be among them (default: "
-            f"{FILTERS.replace(',', ', ')}).",
+            f"{FILTERS.replace(',', ', ')}). {registry.CHOICE}",
         ),
         runtime: str = options.runtime(),
         baselines: bool = BASELINES_OPTION,
