@@ -101,9 +101,10 @@ def test_the_rows_and_the_force_are_those_of_the_attitude():
         earth_kernels.to_earth(s, counts)
         rows = motions._matrix(q[None])[0]
         assert np.abs(np.array(s[AT.R : AT.R + 9]).reshape(3, 3) / 32768 - rows).max() < 1e-4
-        assert np.abs(np.array(s[AT.FORCE : AT.FORCE + 3]) / 32768 - rows @ accel).max() < 6
-        assert s[AT.MN] == 1
-        assert np.abs(np.array(s[AT.MS : AT.MS + 3]) / 512 - rows @ mag).max() < 6
+        earth_kernels.to_earth(s, counts)  # they are summed over the block
+        assert np.abs(np.array(s[AT.FS : AT.FS + 3]) / 512 - 2 * rows @ accel).max() < 12
+        assert s[AT.MN] == 2
+        assert np.abs(np.array(s[AT.MS : AT.MS + 3]) / 512 - 2 * rows @ mag).max() < 12
 
 
 def test_the_heading_is_the_arc_tangent_of_the_mean_field():
@@ -183,14 +184,16 @@ def test_a_bias_is_found_while_everything_turns_from_the_first_second(
 @pytest.mark.parametrize(
     "kick", [(90, 0, 0), (0, -90, 0), (0, 0, 90), (0, 0, -40), (52, 52, 52)], ids=str
 )
-def test_a_kick_at_rest_is_forgotten(history, rate, mag_every, kick):
-    rendered = scene(rate, 37, kick=(25, kick), mag_every=mag_every)
+def test_a_kick_at_rest_is_forgotten(history, kind, rate, mag_every, kick):
+    rendered = scene(rate, 50, kick=(25, kick), mag_every=mag_every)
     got = history(rendered)
     inclination, heading = errors(got.q, rendered)
     at = 25 * rate
     assert max(inclination[at + 1], abs(heading[at + 1])) > 35  # it was one
     assert inclination[at + 4 * rate :].max() < 3
-    assert np.abs(heading[at + 10 * rate :]).max() < 5
+    # a long disagreement restarts the heading, not a short one: the gyro of inertial has seen nothing of a turn
+    late = 20 if kind == "inertial" else 10
+    assert np.abs(heading[at + late * rate :]).max() < 5
     assert np.abs(got.bias_dps[-1] - (1.2, -0.8, 0.6)).max() < 0.1
 
 
@@ -206,11 +209,28 @@ def test_swings_cancel_before_they_count_as_tilt(history):
 
 
 def test_a_turntable_from_power_on_is_taken_for_a_bias(history):
-    """The known limit; after a rest it is not: a known bias does not jump."""
+    """The known limit."""
     rendered = scene(200, 20, lambda t: np.outer(t >= 0, (0, 0, 3.0)), bias_dps=(0, 0, 0))
     assert history(rendered, 6).bias_dps[-1, 2] == pytest.approx(3, abs=0.1)
-    rendered = scene(200, 60, lambda t: np.outer(t > 10, (0, 0, 3.0)), bias_dps=(0, 0, 0))
-    assert history(rendered, 6).bias_dps[-1, 2] == pytest.approx(0, abs=0.1)
+
+
+@pytest.mark.parametrize("rest", [5, 10, 30])
+def test_a_turntable_after_a_rest_is_when_it_has_lasted_as_long_and_never_with_nine_axes(
+    filter_history, rest
+):
+    """12 s at most: six axes cannot tell it from a bias that has changed."""
+
+    def bias(name, seconds):
+        rendered = scene(
+            200, seconds, lambda t: np.outer(t > rest, (0, 0, 3.0)), bias_dps=(0, 0, 0)
+        )
+        return filter_history(quickest(), rendered, name).bias_dps[:, 2]
+
+    waited = min(rest, 12)
+    six = bias("inertial6", rest + waited + 5)
+    assert np.abs(six[: int(200 * (rest + 0.6 * waited))]).max() < 0.2
+    assert six[-1] == pytest.approx(3, abs=0.1)
+    assert np.abs(bias("inertial9", rest + 60)).max() < 0.2
 
 
 def test_no_constant_shrinks_with_the_rate(history, kind):
@@ -246,7 +266,7 @@ def test_what_it_says_of_itself(kind):
     inertial = kind == "inertial"
     assert (filter.resting, filter.mag_accepted) == (False, False)
     if inertial:
-        assert filter.heading_uncertainty_mdeg == pytest.approx(180000, abs=100)
+        assert filter.heading_uncertainty_mdeg == pytest.approx(99000, abs=1000)
         assert filter.tilt_confidence == 1000
     row = counts(flags=3)
     filter.seed(row)
@@ -255,9 +275,9 @@ def test_what_it_says_of_itself(kind):
     run(filter, row, 400)
     assert filter.resting and filter.mag_accepted
     if inertial:
-        assert filter.heading_uncertainty_mdeg < 3000
         assert filter.tilt_confidence > 990
-        run(filter, row, 200 * 5)  # now the field is known
+        run(filter, row, 200 * 12)  # now the field is known
+        assert filter.heading_uncertainty_mdeg < 6000
     run(filter, counts(mx=0, my=400, flags=3), 200)
     assert not filter.mag_accepted
     near = filter.heading_uncertainty_mdeg
@@ -277,10 +297,15 @@ def test_every_rate_from_90_to_1000_hz_will_do(kind, rate, fsr):
     assert KINDS[kind](rate, SCALES[fsr], 2048, **LARGEST_BIAS[kind]).rate[0]
 
 
-@pytest.mark.parametrize("rate", [49, 1440, 8000, 0, -200, (200, 0), 200.5, "200", None])
+@pytest.mark.parametrize("rate", [19, 1440, 8000, 0, -200, (200, 0), 200.5, "200", None])
 def test_a_rate_that_the_numbers_cannot_hold_is_refused(kind, rate):
     with pytest.raises(ValueError, match=r"rate is .*, expected"):
         KINDS[kind](rate, SCALES[250], 2048)
+
+
+@pytest.mark.parametrize("fsr", [250, 500])
+def test_a_loop_of_20_hz_will_do_for_inertial_at_500_deg_s(fsr):
+    assert Inertial9(20, SCALES[fsr], 2048).rate == (20, 1)
 
 
 def test_a_gyro_too_fine_for_the_rest_detector_is_refused(kind):
@@ -289,7 +314,7 @@ def test_a_gyro_too_fine_for_the_rest_detector_is_refused(kind):
 
 
 def test_a_step_that_could_turn_by_too_much_is_refused(kind):
-    slow, least, most = {"inertial": (60, 75, 85), "quaternion-kalman": (50, 50, 60)}[kind]
+    slow, least, most = {"inertial": (60, 60, 70), "quaternion-kalman": (50, 50, 60)}[kind]
     said = rf"rate is {slow} Hz, expected (\d+)..1439 Hz at 82/5"
     with pytest.raises(ValueError, match=said) as caught:
         KINDS[kind](slow, SCALE, 2048)
@@ -302,7 +327,7 @@ def test_a_step_that_could_turn_by_too_much_is_refused(kind):
 @pytest.mark.parametrize(
     "name, parameters, said",
     [
-        ("inertial", {"tau_tilt": 0.1}, "tau_tilt is 0.1, expected 0.5..30"),
+        ("inertial", {"tau_fast": 0.1}, "tau_fast is 0.1, expected 0.5..30"),
         ("inertial", {"field_tolerance": 0.9}, "field_tolerance is 0.9"),
         ("inertial", {"bias_limit_dps": "6"}, "bias_limit_dps is '6', expected a number"),
         ("inertial", {"tau": 3}, "no parameter 'tau'; there are .*rest_after"),
