@@ -81,6 +81,7 @@ def yaw(since, until, dps):
 EVENTS = {
     "turned by hand, then laid down": ({"body_rate": yaw(0, 3, 4.0), "seconds": 60}, {}),
     "a turntable after a rest": ({"body_rate": yaw(20, 70, 2.0), "seconds": 70}, {}),
+    "no samples for a while": ({"body_rate": yaw(9, 10.2, 90.0), "seconds": 20}, {}),
     "a gyro at full scale": ({"body_rate": spin, "seconds": 25}, {}),
     "a magnet for 8 s": ({"body_rate": all_axes, "field": magnet(12, 20), "seconds": 40}, {}),
     "a magnet for 40 s": ({"body_rate": all_axes, "field": magnet(8, 48), "seconds": 60}, {}),
@@ -105,6 +106,8 @@ def test_as_the_float_twin_through_all_that_happens(history):
     taken, left = 0, 0
     for event, (told, start) in EVENTS.items():
         rendered = scene(100, **told)
+        if event.startswith("no samples"):
+            rendered.counts[1003:1150, 10] = 2  # not fresh; not 0, which stands for fresh in a file
         got = history(rendered, **start)
         q, twin = twin_history(rendered, got.decided.tolist(), **start)
         worst = angles_between(got.q, q).max()

@@ -151,7 +151,6 @@ class InertialFloat(FieldFloat):
         self.R = rows([1.0, 0.0, 0.0, 0.0])
         self.P = [[0.0] * 4 for _ in range(4)]
         self.axis = self.side = 0
-        self.gyro_sum, self.pair_sum = [0] * 3, [0] * 3
         self.held = 0.0
         self.blocks = self.still = 0  # of the rest detector
         self.low1, self.low2 = [0.0] * 6, [0.0] * 6
@@ -191,15 +190,13 @@ class InertialFloat(FieldFloat):
         self.q = [v / norm for v in q]
         self.last = [0.0] * 3  # what the step before turned by
         self.turn = [0.0] * 3  # correction (earth) that the next step takes up, rad
-        self.force_sum, self.mag_sum = [0.0] * 3, [0.0] * 3
-        self.mag_n = self.since = self.j = self.gap = 0
+        self._forget_sums()
+        self.since = self.j = self.gap = 0
         self.full = self.clipped = 0
         self.n = self.lean = 0
-        self.pair_sum = [0] * 3
         self.k_pace = self.T / self.p["tau_start"]
         self.again = False
-        self.part, self.phase = PARTS, 1
-        self.level, self.regress = 1, False
+        self.level = 1
         self.s, self.lean_s = [0.0, 0.0, 1.0], [0.0, 0.0]
         self.off = [0.0, 0.0]
         self.c = [0.0, 0.0]  # tilt correction of this block, rad
@@ -208,11 +205,18 @@ class InertialFloat(FieldFloat):
         self.wait = self.lost = 0
         self.wait_e = self.wait_turn = 0.0
         self.own = self.still_set = False
-        self.dx = [0.0] * 4
         self.P[0] = [OPEN if self.axes == 9 else SIX, 0.0, 0.0, 0.0]
         for i in range(1, 4):
             self.P[i][0] = 0.0
         self.doubt = math.sqrt(self.P[0][0])
+
+    def _forget_sums(self):
+        """What was summed is of another attitude; the next blocks are whole ones."""
+        self.force_sum, self.mag_sum, self.mag_n = [0.0] * 3, [0.0] * 3, 0
+        self.gyro_sum, self.pair_sum = [0] * 3, [0] * 3
+        self.dx = [0.0] * 4
+        self.part, self.phase = PARTS, 1
+        self.regress = False
 
     def open_heading(self, variance):
         """The heading's variance is at least this from now on."""
@@ -255,6 +259,7 @@ class InertialFloat(FieldFloat):
         if self.gap >= max(1, self.steps(self.p["outage"])):
             self.again = True
             self.open_heading(OPEN)
+            self._forget_sums()
         self.gap = 0
         if counts[10] & 8:
             self.clipped += 1

@@ -25,10 +25,10 @@ from upright.inertial_kernels import (
     level,
     measure_bias,
     measure_heading,
-    open_heading,
     pace,
     regress,
     smooth_field,
+    start_again,
     take,
 )
 
@@ -498,9 +498,8 @@ class Inertial9(EarthFilter):
                 s[_GAP] += 1
             return
         if s[_GAP] | s[_FULL] | c[10] & 8:
-            if s[_GAP] == s[_OUTAGE]:  # too long: the attitude is unknown
-                s[_AGAIN] = 1
-                open_heading(state, _OPEN)
+            if s[_GAP] == s[_OUTAGE]:
+                start_again(state, counts)
             s[_GAP] = 0
             if c[10] & 8:
                 if s[_CLIPS] < 0x3FFFFFFF:

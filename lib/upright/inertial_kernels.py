@@ -24,6 +24,8 @@ _BLOCK = const(51)  # log2 of the steps of a block
 _PHASE = const(53)  # fresh steps of the block
 _DECIDED = const(54)  # yes/no decisions, for the tests' float twin
 _GS = const(55)  # 3: gyro counts summed over the block
+_MS = const(58)  # 3, Q9: magnetometer in the earth frame, counts, summed over the block
+_MN = const(61)  # samples in it
 _SINCE = const(62)  # blocks since the last with a magnetometer sample, no more than 16
 _J = const(63)  # blocks that the heading of this block stands for; 0: none
 _HEADING = const(64)  # Q28: heading error, rad
@@ -38,6 +40,8 @@ _REST_ACCEL = const(92)  # Q6: the same of the accelerometer
 _REST_MOST = const(93)  # Q12: most that is taken for a bias, counts
 _LEVEL = const(95)  # log2 of the steps of a levelling: 0 at the start, BLOCK in the end
 _LEVEL_MASK = const(96)  # steps of it less 1
+_REGRESS = const(97)  # 1: the regressors take their step next
+_PART = const(98)  # part of the work of two blocks that comes next
 _GG = const(100)  # 3: gyro counts summed over two blocks
 _CLIPPED = const(105)  # samples with one in this block
 _CLIP = const(106)  # Q15: what one adds to the doubt of the heading, units of 2.5 rad
@@ -180,6 +184,7 @@ _TENTH = const(26843546)  # 0.1 rad, Q28
 _SLOW_TURN = const(16106127)  # 0.06 rad, Q28: the magnetometer's noise is less
 _LIMIT = const(5368709)  # 0.02 rad, Q28
 _CAND_TOL = const(93952410)  # 0.35 rad, Q28
+_PARTS = const(8)  # of the work of two blocks: none is left
 _LEAST = const(64)  # Q30: no variance is less
 _HEADING_SHARE = const(7200)  # 0.22, Q15: the magnetometer's errors last, and are not noise alone
 _MOST = const(536870912)  # 4 units, Q27
@@ -227,6 +232,29 @@ def open_bias(state):
     s[_P + 5] = _HALF
     s[_P + 10] = _HALF
     s[_P + 15] = _HALF
+
+
+@micropython.viper
+def start_again(state, counts: ptr16):
+    """The first sample after an outage: the attitude is unknown, and what was summed before it is of another."""
+    s = ptr32(state)
+    s[_AGAIN] = 1
+    open_heading(state, _OPEN)
+    i = 0
+    while i < 3:
+        s[_FS + i] = 0
+        s[_GS + i] = ((counts[3 + i] & 0xFFFF) ^ 0x8000) - 0x8000
+        s[_GG + i] = 0
+        s[_MS + i] = 0
+        i += 1
+    s[_MN] = 0
+    i = 0
+    while i < 4:
+        s[_DX + i] = 0
+        i += 1
+    s[_PHASE] = 1
+    s[_PART] = _PARTS
+    s[_REGRESS] = 0
 
 
 # ------------------------------------------------------------------------------------------ levelling
