@@ -52,6 +52,11 @@ def twin_history(rendered, decided, axes=9, mag_every=1, bias=(), **parameters):
 
 
 # -- accuracy against the float twin; pytest -rP shows the figures
+def test_the_twin_has_the_defaults_of_the_filter():
+    ours = {name: value for name, (value, _, _) in Inertial6.PARAMETERS.items()}
+    assert inertial_float.DEFAULTS == ours
+
+
 @pytest.mark.parametrize("name", motions.MOTIONS)
 @pytest.mark.parametrize("rate, seconds, mag_every", [(100, 30, 1), (200, 20, 3), (1000, 6, 10)])
 def test_never_a_tenth_of_a_degree_from_the_float_twin(history, name, rate, seconds, mag_every):
