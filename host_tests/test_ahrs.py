@@ -702,6 +702,24 @@ def test_the_filter_is_told_how_well_the_bias_is_known(monkeypatch):
     assert known == [10]
 
 
+def test_a_turn_beyond_the_gyros_range_is_counted_and_makes_the_yaw_doubtful():
+    imu, world = start(measure_bias=True)
+    run(3)
+    before = imu.status()
+    assert before["clipped"] == 0
+    assert before["heading_uncertainty"] < 3
+    world.set((0, 0, G, 0, 0, 32767))
+    run(0.1)
+    world.set((0, 0, G))
+    run(0.1)
+    after = imu.status()
+    assert 18 <= after["clipped"] <= 22
+    assert 20 < after["heading_uncertainty"] <= 99.5  # 0.1 s of 2000 deg/s or more
+    imu.stop()
+    imu, _ = start(filter="mahony6")
+    assert imu.status()["clipped"] is None
+
+
 def test_without_a_display_there_is_nothing_to_refresh():
     imu, _ = start()
     assert imu.board is None

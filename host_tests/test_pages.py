@@ -111,6 +111,15 @@ def test_flags_show(bench):
     assert plain[:54] == unknown[:54]
 
 
+@pytest.mark.parametrize("page", [pages.NUMBERS, pages.HORIZON])
+def test_a_doubtful_yaw_is_marked_and_stays_readable(bench, page):
+    plain = draw(bench, page, (0, 0, -178500))
+    doubt = draw(bench, page, (0, 0, -178500), flags=pages.YAW_DOUBTFUL)
+    assert plain != doubt
+    for a, b in zip(plain, doubt, strict=True):
+        assert not any(was and not now for was, now in zip(a, b, strict=True))  # nothing is covered
+
+
 @settings(max_examples=150, deadline=None)
 @given(
     st.integers(-180000, 180000),

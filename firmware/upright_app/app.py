@@ -192,6 +192,9 @@ class App:
             flags |= pages.SENSOR_LOST
         if status["magnetometer_lost"]:
             flags |= pages.MAG_LOST
+        doubt = status["heading_uncertainty"]
+        if doubt is not None and doubt * 1000 > pages.YAW_DOUBT_MDEG:
+            flags |= pages.YAW_DOUBTFUL
         if self._page == pages.STATUS:
             self._fill_status(status)
         self._pages.draw(

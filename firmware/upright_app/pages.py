@@ -24,6 +24,8 @@ STATUS_WORDS = const(6)
 BIAS_UNKNOWN = const(1)  # the gyro's bias was not measured: the yaw drifts
 SENSOR_LOST = const(2)  # no fresh sample: the angles are old
 MAG_LOST = const(4)  # a nine-axis filter has no magnetometer now: the yaw drifts
+YAW_DOUBTFUL = const(8)  # the yaw may be off by more than YAW_DOUBT_MDEG
+YAW_DOUBT_MDEG = const(20000)
 
 _PANEL = const(42)  # columns right of the horizon, for the figures
 _LADDER = const(10)  # degrees between the rungs of the pitch ladder
@@ -113,17 +115,17 @@ class Pages:
         page: NUMBERS, HORIZON, or STATUS, which needs `status`, an array('i') of STATUS_WORDS. angles:
         array('i') of roll, pitch, yaw in millidegrees, within +-180000. rate_hz: samples per second.
         temperature: centidegrees Celsius. faults: a count.
-        flags: BIAS_UNKNOWN, SENSOR_LOST, MAG_LOST.
+        flags: BIAS_UNKNOWN, SENSOR_LOST, MAG_LOST, YAW_DOUBTFUL.
         """
         self._display.fill(BLACK)
         if page == STATUS:
             self._draw_state(status)
         elif page == HORIZON:
-            self._draw_horizon(angles)
+            self._draw_horizon(angles, flags)
         elif self._low:
-            self._draw_numbers_low(angles)
+            self._draw_numbers_low(angles, flags)
         else:
-            self._draw_numbers(angles)
+            self._draw_numbers(angles, flags)
         self._draw_status(rate_hz, temperature, faults, flags)
 
     @micropython.native
@@ -150,10 +152,10 @@ class Pages:
     # -------------------------------------------------------------------------- numbers
 
     @micropython.native
-    def _draw_numbers(self, angles):
+    def _draw_numbers(self, angles, flags):
         self._large("ROLL", angles[0], 1)
         self._large("PITCH", angles[1], 19)
-        self._large("YAW", angles[2], 37)
+        self._large("YAW?" if flags & YAW_DOUBTFUL else "YAW", angles[2], 37)
         self._display.hline(0, 54, self._display.width)
 
     @micropython.native
@@ -163,10 +165,13 @@ class Pages:
         d.text("°", d.number(angle, 55, y, LARGE, 6, 1, 3) + 1, y, LARGE)
 
     @micropython.native
-    def _draw_numbers_low(self, angles):
+    def _draw_numbers_low(self, angles, flags):
         self._column("ROLL", angles[0], 0, 12)
         self._column("PITCH", angles[1], 45, 6)
-        self._column("YAW", angles[2], 90, 18)
+        if flags & YAW_DOUBTFUL:
+            self._column("YAW?", angles[2], 90, 12)
+        else:
+            self._column("YAW", angles[2], 90, 18)
 
     @micropython.native
     def _column(self, name, angle, x, indent):
@@ -177,7 +182,7 @@ class Pages:
     # -------------------------------------------------------------------------- horizon
 
     @micropython.native
-    def _draw_horizon(self, angles):
+    def _draw_horizon(self, angles, flags):
         """Seen along the body's x axis; a positive roll (right side down) lifts the right end."""
         d = self._display
         sin = sine(angles[0])
@@ -194,6 +199,9 @@ class Pages:
             degree += _LADDER
         self._draw_symbol()
         self._draw_figures(angles)
+        if flags & YAW_DOUBTFUL:  # where a sign would stand
+            x = self._window + 9
+            d.text("?", x, 16 if self._low else 45)
 
     @micropython.native
     def _rung(self, degree, half, nose, sin, cos):

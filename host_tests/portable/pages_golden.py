@@ -107,6 +107,8 @@ def every_page(bench, tag):
     bench.page("lost_" + tag, pages.NUMBERS, (1000, 2000, 3000), 200, 3652, 12, 3)
     bench.page("no_mag_" + tag, pages.NUMBERS, (1000, 2000, 3000), 1000, 3652, 12, 4)
     bench.page("neither_" + tag, pages.HORIZON, LEVEL, 1000, 3652, 12, 5)
+    bench.page("doubt_" + tag, pages.NUMBERS, (1000, 2000, -178500), 200, 3652, 0, 8)
+    bench.page("doubt_horizon_" + tag, pages.HORIZON, (20000, -8000, 178500), 200, 3652, 0, 8)
     bench.state("state_" + tag, (1, 1, 1199, -801, 598, 2345))
     bench.state("state_bad_field_" + tag, (0, 2, -12345, 20000, -7, 179999))
     bench.state("state_six_" + tag, (-1, -1, 0, 0, 0, -1))

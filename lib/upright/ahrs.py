@@ -632,6 +632,7 @@ class AHRS:
             if filter.AXES < 9
             else not mag_lost and getattr(filter, "mag_accepted", True),
             "heading_uncertainty": None if doubt is None else doubt / 1000,
+            "clipped": getattr(filter, "clipped", None),
             "missed": tick.missed,
             "crashes": tick.crashes,
             "error": tick.error,
