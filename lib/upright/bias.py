@@ -21,8 +21,8 @@ _REST_WINDOW_MS = const(1000)
 _REST_TRIES = const(4)
 _REST_READS_HZ = const(200)  # at least, with the slowest bus
 
-# How well a bias is known, in seconds of rest: one that was measured just now, and one of another day, when the chip was
-# colder or warmer.
+# How well a bias is known, in seconds of rest: one that was measured just now, and one of another day, when the chip
+# was colder or warmer.
 _MEASURED_S = const(100)
 _STORED_S = const(10)
 

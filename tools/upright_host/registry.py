@@ -5,7 +5,6 @@ import inspect
 from upright_host import library
 from upright_host.console import Wrong
 
-
 # for the help texts of the commands that take a filter's name
 CHOICE = (
     "For use: inertial6, inertial9. The classic: mahony6, mahony9. To study and compare: euler6, "
