@@ -83,7 +83,7 @@ def test_replay_takes_the_gains(upright, trial, tmp_path):
 
 @pytest.mark.parametrize(
     "name, said",
-    [("nope", "unknown filter 'nope'; there are mahony6"), ("dmp6", "computed in the sensor")],
+    [("nope", "unknown filter 'nope'; there are inertial6"), ("dmp6", "computed in the sensor")],
 )
 def test_replay_refuses_a_filter_that_it_cannot_feed_in_one_line(upright, trial, name, said):
     done = upright("replay", trial, "--filter", name)

@@ -186,7 +186,7 @@ def test_a_baseline_has_errors_but_no_costs(run, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "runtime", "code", "message"),
     [
-        (("--filters", "mahony7"), "cpython", 2, "unknown filter 'mahony7'; there are mahony6"),
+        (("--filters", "mahony7"), "cpython", 2, "unknown filter 'mahony7'; there are inertial6"),
         (("--filters", ","), "cpython", 2, "no filter is named"),
         (("--png", "one.png"), "cpython", 2, "one.png is one file, and there are 2 trials"),
         ((), "brainfuck", 2, "unknown runtime 'brainfuck'; there are cpython"),
