@@ -130,7 +130,7 @@ def test_as_the_float_twin_through_all_that_happens(history):
 FIGURES = {
     "mpu6050_static": {"inclination": 0.1, "aligned_heading": 1.0},
     "tyrex_nexus5_Thibaud_NoDist": {"aligned_total": 5.7},
-    "broad_": {"inclination": 1.3, "total": 3.2},
+    "broad_": {"inclination": 1.3, "total": 3.6},  # a magnet is attached to 34: the gyro alone,
 }
 
 
@@ -199,7 +199,7 @@ def test_a_magnet_comes_and_goes(history, rate, mag_every, moving):
         _, heading = errors(history(rendered).q, rendered)
         # moving, the bias is still being learnt at 10 s
         assert np.abs(heading[10 * rate :]).max() < (5 if moving else 1), extra
-        if rate == 90 and extra[1] == 40:  # did it take any field, it would show
+        if moving and rate == 90 and extra[1] == 40:  # did it take any field, it would show
             careless = {"field_tolerance": 0.7, "field_gate": 3}
             _, heading = errors(history(rendered, gains=careless).q, rendered)
             assert np.abs(heading[10 * rate :]).max() > 5

@@ -178,7 +178,10 @@ def test_through_the_chips_it_is_the_same_motion(run, folder, tmp_path):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (("--filters", "mahony7"), "unknown filter 'mahony7'; there are inertial6, inertial9, mahony6"),
+        (
+            ("--filters", "mahony7"),
+            "unknown filter 'mahony7'; there are inertial6, inertial9, mahony6",
+        ),
         (("--filters", ","), "no filter is named"),
         (("nothing",), "nothing: no such file"),
     ],

@@ -555,7 +555,7 @@ class InertialFloat(FieldFloat):
         noise /= self.tilt_weight
         if self.n < full:
             noise *= (full / self.n) ** 2
-        value = clamp(-self.c[i] / self.T, 4 * unit)
+        value = clamp(-self.c[i] / (self.level * self.dt), 4 * unit)
         self._take([0.0, *self.y[3 * i : 3 * i + 3]], value, min(noise, NOISE_MOST * unit**2))
 
     def _apply(self):

@@ -1209,11 +1209,13 @@ def measure_bias(s: ptr32) -> int:
     # -C as a rate, less what DX says already
     x = 0 - (s[_C + i] << k >> k)
     gain = s[_CC]
-    most = (0x1FFFFFFF // gain) << 10
+    r = s[_BLOCK] - s[_LEVEL]
+    most = (0x1FFFFFFF // gain << 10) >> r
     if x > most:
         x = most
     elif x < 0 - most:
         x = 0 - most
+    x <<= r
     m = x >> 10
     e = m * gain + ((x - (m << 10)) * gain >> 10)
     # Z = P Y', Y in Q15
