@@ -227,7 +227,7 @@ def test_a_bias_that_was_set_is_subtracted_and_what_is_learnt_at_rest_comes_on_t
     made.angles(out)
     assert abs(out[2]) < 5
     row[5] = 853  # 2.01 deg/s more
-    for _ in range(200 * 10):
+    for _ in range(200 * 15):  # it contradicts the rest before, for 12 s
         made.update(row)
     made.bias_mdps(out)
     assert out[2] == pytest.approx(853000 / 16.4, abs=50)

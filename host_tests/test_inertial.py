@@ -54,7 +54,7 @@ def twin_history(rendered, decided, axes=9, mag_every=1, bias=(), **parameters):
 # -- accuracy against the float twin; pytest -rP shows the figures
 def test_the_twin_has_the_defaults_of_the_filter():
     ours = {name: value for name, (value, _, _) in Inertial6.PARAMETERS.items()}
-    assert inertial_float.DEFAULTS == ours
+    assert ours == inertial_float.DEFAULTS
 
 
 @pytest.mark.parametrize("name", motions.MOTIONS)
@@ -215,8 +215,6 @@ def test_a_turntable_after_a_rest_is_not_taken_for_a_bias(history, rate, mag_eve
 
     minute, turn = 60 * rate, 120 * rate
     rendered = scene(rate, 250, turntable, mag_every=mag_every)
-    _, heading = errors(history(rendered, 6).q, rendered)
-    assert np.abs(heading[10 * rate :] - heading[10 * rate]).max() < 0.6
     got = history(rendered)
     _, heading = errors(got.q, rendered)
     heading = heading[10 * rate :]

@@ -410,7 +410,7 @@ def disturb(rng, filter):
     for i in range(4):
         s[AT.Q + i] = (int(q[i]) >> 15 << 15) + rng.choice((16383, 16384, -16383))
     block = 1 << s[AT.BLOCK]
-    put(AT.HS, 3, 29000000 * (block - 1))
+    put(AT.FS, 3, 29000000 * (block - 1))
     put(AT.AS, 3, 32768 * (block - 1))
     put(AT.GS, 3, 32768 * (block - 1))
     n = rng.randint(0, block - 1)
@@ -469,7 +469,7 @@ def stand_still(rng, filter, row):
         for i, v in enumerate((g * 6 // 10, 0, g * 8 // 10)):
             row[i] = v
             s[AT.AS + i] = v * ((1 << s[AT.BLOCK]) - 1)
-            s[AT.HS + i] = s[AT.AS + i] << 9
+            s[AT.FS + i] = s[AT.AS + i] << 9
             s[AT.LOW1 + i] = s[AT.LOW2 + i] = v << 12
         for i in range(3):
             s[AT.B + i] = s[AT.LOW2 + 3 + i] = s[AT.LOW1 + 3 + i] = 0
@@ -485,7 +485,7 @@ def stand_still(rng, filter, row):
             row[10] = 1
     elif rng.random() < 0.5:  # in free fall, so that nothing tells of a tilt
         for i in range(3):
-            row[i] = s[AT.HS + i] = s[AT.AS + i] = s[AT.LOW1 + i] = s[AT.LOW2 + i] = 0
+            row[i] = s[AT.FS + i] = s[AT.AS + i] = s[AT.LOW1 + i] = s[AT.LOW2 + i] = 0
 
 
 def test_nothing_leaves_32_bits_at_the_corners_of_the_accepted_range(checked):

@@ -6,12 +6,8 @@ import translate
 from field_scenes import SCENES
 
 # What the filters do not reach yet
-BEYOND = (
-    *("by hand", "measured while", "parked, z", "parked, all drifted by 2", "turntable at 0.5"),
-    *("bias ", "bad start 8", "bad start 9", "magnet while", "field turned"),
-    *("5 minutes beside 10,15,5", "5 minutes beside -15", "push 0.3 g 2 s", "push 0.5", "car"),
-    *("spin of 3000 deg/s about 1", "quick turn", "cone at 100", "cone at 200", "20 Hz"),
-)
+# a field turned at equal strength and dip, while the body moves: believed after 8 s, as if the attitude were wrong
+BEYOND = ("field turned by 32 for 22", "field turned by -54 for 13", "field turned by 45 for 20")
 pytestmark = pytest.mark.skipif(not translate.GCC, reason=translate.NO_GCC)
 
 

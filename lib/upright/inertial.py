@@ -404,12 +404,13 @@ class Inertial9(EarthFilter):
 
     @property
     def heading_uncertainty_mdeg(self):
-        """Standard deviation of the heading's error in millidegrees, 0..99000, as far as the filter can know it.
+        """Standard deviation of the heading's error in millidegrees; 180000: nothing is known of it.
 
         It grows with what is not known of the vertical bias, with turning, and with a gyro at full scale; the
         magnetometer takes it back. Six axes: since the start.
         """
-        return (self.state[_DOUBT] >> 15) * 7162 >> 10
+        s = self.state
+        return 180000 if s[_P] >= _OPEN else (s[_DOUBT] >> 15) * 7162 >> 10
 
     @property
     def clipped(self):
