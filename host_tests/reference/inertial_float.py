@@ -114,7 +114,10 @@ SOON = 0.3  # s
 JUMP_DPS = 1.0
 WAIT_FIELD, WAIT_SURE = 60.0, 30.0  # s
 WAIT_MOVED_G = 0.03
-TURN_SURE, TURN_LEAST = 0.06, 0.02  # rad
+TURN_LEAST, TURN_MOST_SEEN = (
+    0.1,
+    0.25,
+)  # rad: four times the noise of two headings; more is not counted
 OPEN, SIX = 3.0, 2**-14 * 6.25  # rad**2: nothing is known of the heading; six axes: the start's
 WALK = 0.0006  # rad per root s
 LIMIT, LIMIT_DOUBT = 0.02, 0.6875  # rad, 1
@@ -439,17 +442,19 @@ class InertialFloat(FieldFloat):
         self.wait += 1
         if self.wait == 1:
             self.wait_e, self.wait_turn, self.wait_a = self.e, 0.0, self.low2[0:3]
-        turn = abs(sum(u * v for u, v in zip(self.R[2], off, strict=True))) * self.wait * self.T2
+        up = abs(sum(u * v for u, v in zip(self.R[2], off, strict=True)))
+        turn = min(up * self.wait * self.T2, TURN_MOST_SEEN)
         turned = sum((a - b) ** 2 for a, b in zip(self.low2, self.wait_a, strict=False))
         turned = turned > (WAIT_MOVED_G * self.lsb) ** 2
         adopt = False
         if not turned and known and self.wait >= self._patience(min(known)):
             if self._field_known() and self.decided & NEAR_REFERENCE:
                 # what the gyro says the heading turned by; the magnetometer knows better
-                if turn >= TURN_SURE or self.wait >= self.pairs(WAIT_SURE):
-                    moved = wrap(self.e - self.wait_e) + self.wait_turn
-                    turned = turn > TURN_LEAST and abs(moved) < turn / 2
-                    adopt = not turned
+                moved = abs(wrap(self.e - self.wait_e) + self.wait_turn)
+                sure = self.wait >= self.pairs(WAIT_SURE)
+                if moved < TURN_LEAST:
+                    turned = turn >= 2 * TURN_LEAST or (sure and moved < turn / 2)
+                adopt = not turned and (moved >= TURN_LEAST or sure)
             else:
                 adopt = not self._field_known() or self.wait >= self.pairs(WAIT_FIELD)
         turned = self.decide(TURNED, turned)

@@ -181,7 +181,6 @@ _OPEN = const(515396076)  # 3 rad**2 in units of (2.5 rad)**2, Q30: nothing is k
 _TENTH_P = const(107374182)  # 0.1, Q30
 _FORGOTTEN = const(51539608)  # 0.3 rad**2 in units of (2.5 rad)**2, Q30
 _TENTH = const(26843546)  # 0.1 rad, Q28
-_SLOW_TURN = const(16106127)  # 0.06 rad, Q28: the magnetometer's noise is less
 _LIMIT = const(5368709)  # 0.02 rad, Q28
 _CAND_TOL = const(93952410)  # 0.35 rad, Q28
 _PARTS = const(8)  # of the work of two blocks: none is left
@@ -610,19 +609,20 @@ def detect_rest(state):
                     turn = i
                 turn = turn * s[_GYRO] >> 4
                 if field and near:
-                    if turn < _SLOW_TURN and wait < s[_WAIT_SURE]:
-                        x = 0x3FFFFFFF
-                    else:
-                        y = (s[_HEADING] << k >> k) - (s[_WAIT_E] << k >> k)
-                        if y > _PI28:
-                            y = y - _PI28 - _PI28
-                        elif y < 0 - _PI28:
-                            y = y + _PI28 + _PI28
-                        y += s[_WAIT_TURN] << k >> k
-                        if y < 0:
-                            y = 0 - y
-                        if turn > 5368709 and y < turn >> 1:
+                    y = (s[_HEADING] << k >> k) - (s[_WAIT_E] << k >> k)
+                    if y > _PI28:
+                        y = y - _PI28 - _PI28
+                    elif y < 0 - _PI28:
+                        y = y + _PI28 + _PI28
+                    y += s[_WAIT_TURN] << k >> k
+                    if y < 0:
+                        y = 0 - y
+                    # 0.1 rad are four times the noise of two headings
+                    if y < _TENTH:
+                        if turn >= _TENTH << 1 or (wait >= s[_WAIT_SURE] and y < turn >> 1):
                             decided |= _TURNED
+                        elif wait < s[_WAIT_SURE]:
+                            x = 0x3FFFFFFF
                 if x <= wait and decided & _TURNED == 0:
                     decided |= _ADOPT
             if decided & _ADOPT:
