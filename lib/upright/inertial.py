@@ -177,7 +177,7 @@ class Inertial9(EarthFilter):
     turn from a bias.
 
     Raises ValueError for a rate, scale or parameter that the numbers cannot hold, with the range that they can:
-    20 to 1439 Hz at +-500 deg/s and less, from 46 Hz on at +-1000, from 91 Hz on at +-2000 deg/s.
+    20 to 1439 Hz at +-500 deg/s and less, from 34 Hz on at +-1000, from 68 Hz on at +-2000 deg/s.
 
     state: array('i'); state[QUATERNION] and the next three words are w x y z in Q29.
     """
