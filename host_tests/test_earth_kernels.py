@@ -233,6 +233,18 @@ def test_a_turntable_after_a_rest_is_when_it_has_lasted_as_long_and_never_with_n
     assert np.abs(bias("inertial9", rest + 60)).max() < 0.2
 
 
+@pytest.mark.skipif(not translate.GCC, reason=translate.NO_GCC)
+@pytest.mark.parametrize("rate, mag_every", PACES)
+@pytest.mark.parametrize("dps", [0.5, 1, 2, 3])
+def test_a_magnetometer_tells_minutes_of_a_turntable_from_a_bias(rate, mag_every, dps):
+    """A wait follows the other, and the noise of none may decide."""
+    rendered = scene(rate, 310, lambda t: np.outer(t > 10, (0, 0, dps)), mag_every=mag_every)
+    run = translate.make("inertial9", rendered.rate, rendered.gyro_scale, rendered.accel_lsb_per_g)
+    run.filter.seed(array("h", rendered.counts[0].tolist()))
+    _, heading = errors(run.attitudes(rendered.counts), rendered)
+    assert np.abs(heading[10 * rate :]).max() < 1.5
+
+
 def test_no_constant_shrinks_with_the_rate(history, kind):
     """The same 40 s at 90 and at 1000 Hz: the same errors, the same bias, at the same times."""
     bias = (2, -3, 1)

@@ -208,7 +208,7 @@ def test_a_magnet_comes_and_goes(history, rate, mag_every, moving):
 @pytest.mark.slow
 @pytest.mark.parametrize("rate, mag_every", PACES)
 def test_a_turntable_after_a_rest_is_not_taken_for_a_bias(history, rate, mag_every):
-    """4 minutes of it; heading error below 1 degree a minute, and in fact at any time."""
+    """4 minutes of it, nine axes; heading error below 1 degree a minute, and in fact at any time."""
 
     def turntable(t):
         return np.outer(t > 10, (0, 0, 3.0))
@@ -219,9 +219,9 @@ def test_a_turntable_after_a_rest_is_not_taken_for_a_bias(history, rate, mag_eve
     _, heading = errors(got.q, rendered)
     heading = heading[10 * rate :]
     # The accelerometer's 0.3 degrees of offset show in the steep field, to one side and half a turn later to the other;
-    # from one turn to the next nothing is left of it.
+    # the rest's share of it goes slowly, since the gyro is known well.
     assert np.abs(heading).max() < 1
-    assert abs(heading[:turn].mean()) < 0.1 and abs(heading[-turn:].mean()) < 0.1
+    assert abs(heading[:turn].mean()) < 0.3 and abs(heading[-turn:].mean()) < 0.1
     assert np.abs(got.bias_dps[-1] - (1.2, -0.8, 0.6)).max() < 0.02
     # and without that offset, as calibrated, between any two times a minute apart
     rendered = scene(rate, 250, turntable, mag_every=mag_every, accel_offset_g=(0, 0, 0))
