@@ -245,6 +245,24 @@ def test_a_magnetometer_tells_minutes_of_a_turntable_from_a_bias(rate, mag_every
     assert np.abs(heading[10 * rate :]).max() < 1.5
 
 
+@pytest.mark.parametrize("known_s, most_deg", [(100, 2), (10, 8)])
+def test_a_bias_that_is_known_from_the_start_keeps_the_yaw_of_six_axes(
+    filter_history, known_s, most_deg
+):
+    """Set to 0.05 deg/s, as a measurement is; the body turns on all axes from the first second on and never rests."""
+    rendered = scene(200, 60, all_axes, pushes, (2, -3, 2.5))
+    bias = [round((b + 0.05) * 16.4 * 256) for b in (2, -3, 2.5)]
+
+    def drift(*known):
+        got = filter_history(quickest(), rendered, "inertial6", bias=[*bias, *known])
+        _, heading = errors(got.q, rendered)
+        return np.abs(heading - heading[0]).max()
+
+    drifts = drift(known_s), drift()
+    print(drifts)
+    assert drifts[0] < min(most_deg, drifts[1] / 2)
+
+
 def test_no_constant_shrinks_with_the_rate(history, kind):
     """The same 40 s at 90 and at 1000 Hz: the same errors, the same bias, at the same times."""
     bias = (2, -3, 1)
