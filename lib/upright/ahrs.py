@@ -109,7 +109,7 @@ class AHRS:
         if callable(sensor) or not hasattr(sensor, "configure"):  # callable: the class itself
             raise TypeError("the sensor is a driver, as in AHRS(MPU6050(i2c)), not %r" % (sensor,))
         if on_step is not None and not callable(on_step):
-            raise TypeError("on_step is a function that takes the AHRS, not %r" % (on_step,))
+            raise TypeError("on_step is a function, not %r" % (on_step,))
         given = {"RATE": rate, "FILTER": filter, "DRIVE": drive, "CALIBRATION": calibration}
         if isinstance(magnetometer, str):
             given["MAGNETOMETER"] = magnetometer
@@ -263,9 +263,7 @@ class AHRS:
         if callable(self._timer):
             ticker = self._timer(rate, callback)
             if not hasattr(ticker, "what"):
-                raise ValueError(
-                    "make_tick() returned %r, expected a Ticker (timing.py)" % (ticker,)
-                )
+                raise ValueError("make_tick() returned %r, expected a Ticker" % (ticker,))
             return ticker
         from upright import timing
 
@@ -345,10 +343,9 @@ class AHRS:
             )
         self.log(
             "sensor: %s, %d/%d Hz, +-%d g, +-%d deg/s"
-            % ((sensor.chip,) + sensor.sample_rate + (sensor.accel_range_g, sensor.gyro_range_dps))
+            % ((sensor.chip,) + sensor.sample_rate + (sensor.accel_range_g, sensor.gyro_range_dps)),
+            *sensor.remarks,
         )
-        for remark in getattr(sensor, "remarks", ()):
-            self.log("sensor:", remark)
 
     def _open_magnetometer(self):
         """Configure the magnetometer. Until it answers, the attitude comes from six axes."""
@@ -627,7 +624,7 @@ class AHRS:
             "magnetometer_lost": filter.AXES == 9 and mag_lost,
             "bias_known": self.bias.known,
             "bias_dps": tuple([b / 1000 for b in bias]),
-            "at_rest": filter.resting and not lost if hasattr(filter, "resting") else None,
+            "at_rest": getattr(filter, "resting", None) and not lost,
             "field_accepted": None
             if filter.AXES < 9
             else not mag_lost and getattr(filter, "mag_accepted", True),

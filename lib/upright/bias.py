@@ -10,7 +10,6 @@ from micropython import const
 _KEEP_AFTER_S = const(10)
 _KEEP_EVERY_S = const(600)  # at least between two writes of the flash
 _KEEP_MDPS = const(20)  # and a change
-_G_LEAST, _G_MOST = 0.8, 1.2  # what an accelerometer measures at rest
 
 # At rest: the most that gyro and accelerometer of an MPU6050 may change in a window, and the largest bias (PS 6.1:
 # zero-rate output +-20 deg/s).
@@ -36,7 +35,6 @@ class Bias:
         self._rested_s = 0
         self._kept_s = _KEEP_EVERY_S  # since the last write
         self._learnt = array("i", [0] * 3)
-        self._steps = self._fresh = 0
 
     def find(self):
         """Give the filter a first value: the stored bias, or a measured one, or none."""
@@ -66,7 +64,7 @@ class Bias:
         most boards a write to the flash blocks everything for some hundredths of a second."""
         ahrs = self._ahrs
         self._kept_s += seconds
-        if not ahrs.filter.resting or not self._measured():
+        if not ahrs.status()["at_rest"]:  # a sensor that is gone does not rest
             self._rested_s = 0
             return
         self.known = True
@@ -89,18 +87,6 @@ class Bias:
             ahrs.log("bias: kept in", path)
         except (OSError, ValueError) as why:
             ahrs.log("bias: not kept:", why)
-
-    def _measured(self):
-        """Did most steps since the last call have a fresh sample, and is what the accelerometer says gravity? A sensor
-        that is gone rests for ever."""
-        ahrs = self._ahrs
-        steps, fresh = ahrs.tick.steps - self._steps, ahrs.tick.fresh - self._fresh
-        self._steps, self._fresh = ahrs.tick.steps, ahrs.tick.fresh
-        return 2 * fresh > steps and self._is_gravity(list(ahrs.counts[:3]))
-
-    def _is_gravity(self, accel):
-        g = sum([a * a for a in accel]) ** 0.5 / self._ahrs.sensor.accel_lsb_per_g
-        return _G_LEAST < g < _G_MOST
 
     def _measure(self, tries):
         """Set the bias to the mean of the gyro over a window at rest. Returns False if the board was never at rest."""
@@ -139,7 +125,6 @@ class Bias:
                 max(spread[:3]) <= accel_most
                 and max(spread[3:]) <= gyro_most
                 and max(abs(m) for m in mean) <= 256 * bias_most
-                and self._is_gravity([t // n for t in total[:3]])
             ):
                 ahrs.filter.set_bias(*mean, _MEASURED_S)
                 ahrs.log("bias: %s mdeg/s" % ([m * 1000 * den // (256 * num) for m in mean],))

@@ -26,7 +26,7 @@ _FIFO_EN = const(0x40)
 _DMP_RESET = const(0x08)
 _READY_AND_OVERFLOW = const(0x11)  # INT_ENABLE: DATA_RDY, FIFO_OFLOW
 
-_HEAD = const(6)  # bytes of the FIFO's buffer before the first packet: HEAD of mpu_fifo.py
+_HEAD = const(6)  # bytes of the FIFO's buffer before the first packet, see mpu_fifo.py
 _BASE_HZ = const(200)  # the images are made for this sample rate
 _ORDERLY = const(4)  # packets that the start-up check wants to see
 _COUNT_MASK = const(0x3FFFFFFF)
@@ -214,6 +214,7 @@ class MpuDmp(Attitude, Counters):
         s[_STEP] = image.step
         s[_FULL] = image.accel_full
         self.fifo.prepare(batch)
+        self.remarks = ()
         self.stale = 0
         self.skipped = 0
         self.misaligned = 0

@@ -10,17 +10,7 @@ import micropython
 from micropython import const
 
 from upright import mpu_parts
-from upright.mpu_fifo import (
-    ENABLED,
-    SAME,
-    SAME_SEEN,
-    SAME_TAKEN,
-    STATUS,
-    Counters,
-    Fifo,
-    make_buffer,
-    unpack,
-)
+from upright.mpu_fifo import Counters, Fifo, make_buffer, unpack
 from upright.mpu_monitor import Monitor
 from upright.mpu_table import RegisterTable
 
@@ -52,7 +42,13 @@ _CLK_PLL = const(0x01)  # CLKSEL 1, PLL on the X gyro: RM 4.28 prefers it to the
 _MASTER_MS = const(5)  # the master needs it for 24 bytes and five addresses at the slowest clock
 _EXT_BYTES = const(24)  # EXT_SENS_DATA
 _PACKET = const(14)  # accel x y z, temperature, gyro x y z
-_HEAD = const(6)  # bytes before the first packet: HEAD of mpu_fifo.py
+# The head of a buffer, see mpu_fifo.py
+_HEAD = const(6)
+_SAME = const(2)
+_ENABLED = const(3)
+_STATUS = const(5)
+_SAME_SEEN = const(1)
+_SAME_TAKEN = const(2)
 
 # Until the zero-rate output has settled: PS 6.1; PS-MPU-6500A rev 1.3, table 1
 _GYRO_START_MS = const(30)
@@ -88,10 +84,10 @@ class Mpu(Counters):
     manager (`with`) the driver puts the chip to sleep at the end; entering configures nothing.
 
     Counters, wrapping at 2**30: errors (faults of the bus; on SPI, reads of a floating bus), stale (read() found
-    nothing new), frozen (samples that were the same for too long), resets (of the chip by itself), full_resets (by
-    health(), when no samples came), fifo_overflows, fifo_resets, fifo_lost (packets, also those that came while nobody
-    could read). fifo_level is the number of packets that the last poll left in the chip. chip is the part's name,
-    who_am_i its identity, remarks a list of lines on how it differs from its data sheet.
+    nothing new), resets (of the chip by itself), full_resets (by health(), when no samples came), fifo_overflows,
+    fifo_resets, fifo_lost (packets, also those that came while nobody could read). fifo_level is the number of packets
+    that the last poll left in the chip. chip is the part's name, who_am_i its identity, remarks a list of how
+    it differs from its data sheet.
 
     Set-up methods are not interrupt-safe: stop the tick first.
     """
@@ -160,16 +156,16 @@ class Mpu(Counters):
 
     def _unusual(self, raw):
         """What is not an ordinary sample: flags if it is one all the same, else 0."""
-        if raw[SAME] != SAME_SEEN:
+        if raw[_SAME] != _SAME_SEEN:
             if not self._is_sample(raw):
                 return 0
             flags = unpack(raw, _HEAD, self.counts)
             if flags:
                 return flags
-        raw[STATUS] = 0xFF
+        raw[_STATUS] = 0xFF
         if not self.monitor.same(raw):
             return 0
-        raw[STATUS] = _DATA_RDY
+        raw[_STATUS] = _DATA_RDY
         return unpack(raw, _HEAD, self.counts)
 
     def _withheld(self):
@@ -186,8 +182,8 @@ class Mpu(Counters):
 
     def _is_sample(self, raw):
         """Is there a new sample? Handles every other value of INT_STATUS."""
-        status = raw[STATUS]
-        raw[STATUS] = 0xFF
+        status = raw[_STATUS]
+        raw[_STATUS] = 0xFF
         if status & _NO_STATUS:  # a floating bus, or a transfer that did not fill the buffer
             self.monitor.fault()
             return False
@@ -195,8 +191,8 @@ class Mpu(Counters):
             self.monitor.fifo_misaligned = 1  # reading the flag has cleared it
         if self._by_time:
             status |= self._is_due(raw)
-        if status & _DATA_RDY and raw[ENABLED] & _DATA_RDY:
-            raw[STATUS] = _DATA_RDY  # the rest is handled
+        if status & _DATA_RDY and raw[_ENABLED] & _DATA_RDY:
+            raw[_STATUS] = _DATA_RDY  # the rest is handled
             return True
         self.stale = (self.stale + 1) & _COUNT_MASK
         self.monitor.no_sample(raw)
@@ -602,7 +598,7 @@ class Mpu(Counters):
             self.write_register(_ACCEL_CONFIG2, 0x05)
             if self.read_register(_ACCEL_CONFIG2) & 0x0F != 0x05:
                 self._own_accel_filter = False
-                self.remarks.append("it has no ACCEL_CONFIG2: dlpf sets both filters")
+                self.remarks.append("(it has no ACCEL_CONFIG2)")
 
     def _learn_habits(self, period_ms):
         """Wait as _settle() does, and find out meanwhile how the chip says that it has sampled."""
@@ -613,15 +609,15 @@ class Mpu(Counters):
         registers.read_registers(_INT_STATUS, self._burst)
         time.sleep_ms(max(self.settle_ms - 1, period_ms + 1))
         registers.read_registers(_INT_STATUS, self._burst)
-        always = raw[STATUS] & _DATA_RDY
+        always = raw[_STATUS] & _DATA_RDY
         registers.write_register(_INT_ENABLE, _DATA_RDY)
         if always:
             self._trust(False)
-            self._tell("it sets DATA_RDY without INT_ENABLE: each sample is read with INT_ENABLE")
+            self._tell("(it sets DATA_RDY without INT_ENABLE)")
         begun = time.ticks_ms()
         while True:
             registers.read_registers(self._first, self._burst)
-            if raw[STATUS] & _DATA_RDY:
+            if raw[_STATUS] & _DATA_RDY:
                 break
             if time.ticks_diff(time.ticks_ms(), begun) > 2 * period_ms + 5:
                 # after its reset only a chip that samples has anything here
@@ -629,15 +625,15 @@ class Mpu(Counters):
                 break
             time.sleep_us(200)
         if self._by_time:
-            self._tell("it never sets DATA_RDY (a simulator, or a clone): going by time")
-            raw[STATUS] = _DATA_RDY
+            self._tell("(it never sets DATA_RDY: going by time)")
             self.monitor.constant = not self._varies(period_ms)
+            raw[_STATUS] = _DATA_RDY
             if self.monitor.constant:
-                self._tell("its samples never vary, as a simulator's")
-        raw[SAME] = SAME_TAKEN
+                self._tell("(its samples never vary)")
+        raw[_SAME] = _SAME_TAKEN
         if unpack(raw, _HEAD, self.counts):
             self.monitor.not_fresh()
-        raw[SAME] = 0
+        raw[_SAME] = 0
         self.monitor.heard()
 
     def _varies(self, period_ms):
@@ -647,9 +643,7 @@ class Mpu(Counters):
             time.sleep_ms(period_ms)
             self.registers.read_registers(self._first, self._burst)
             if bytes(self._raw[_HEAD:]) != first:
-                self._raw[STATUS] = _DATA_RDY
                 return True
-        self._raw[STATUS] = _DATA_RDY
         return False
 
     def _trust(self, data_ready):
@@ -657,9 +651,9 @@ class Mpu(Counters):
         self._by_time = self.monitor.constant = False
         self._always = not data_ready
         self._first = _INT_STATUS if data_ready else _INT_ENABLE
-        self._burst = memoryview(self._raw)[STATUS if data_ready else ENABLED :]
-        self._raw[ENABLED] = _DATA_RDY
-        self.fifo.distrust(self._always)
+        self._burst = memoryview(self._raw)[_STATUS if data_ready else _ENABLED :]
+        self._raw[_ENABLED] = _DATA_RDY
+        self.fifo.proof = _DATA_RDY if data_ready else 0
 
     def _tell(self, remark):
         if remark not in self.remarks:
@@ -675,10 +669,10 @@ class Mpu(Counters):
         # a sample that was ready meanwhile: accel() has it until there is a newer one
         raw = self._raw
         self.registers.read_registers(self._first, self._burst)
-        raw[SAME] = SAME_TAKEN
+        raw[_SAME] = _SAME_TAKEN
         if unpack(raw, _HEAD, self.counts):
             self.monitor.not_fresh()
-        raw[SAME] = 0
+        raw[_SAME] = 0
         self.monitor.heard()
 
     def _need_configured(self):

@@ -33,6 +33,8 @@ class I2CPort:
     after_reset = ()
 
     def __init__(self, i2c, address, accept_unknown, error_class, name, only_6500):
+        if address in (0xD0, 0xD2):
+            raise ValueError(f"0x{address:02x} is the 8-bit form: pass 0x{address >> 1:02x}")
         self.registers = I2CRegisters(
             i2c, _ADDRESSES[0] if address is None else address, error_class, mpu_parts.name
         )

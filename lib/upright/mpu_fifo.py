@@ -27,25 +27,25 @@ _COUNT_MASK = const(0x3FFFFFFF)
 _MOST_LOST_US = const(2_000_000)  # an outage is counted in packets: what is older means nothing
 _SAME_PARTS = const(3)  # polls in a row that find the same part of a packet
 
-# The head of a buffer of samples: HEAD bytes, then the first packet. In order: not 0 since a poll found nothing new,
-# see mpu_monitor.py; the samples that differed from the one before, up to VARIED; whether the newest is the same
+# The head of a buffer of samples: _HEAD bytes, then the first packet. In order: not 0 since a poll found nothing new,
+# see mpu_monitor.py; samples that differed from the one before, up to _VARIED; whether the newest is the same
 # (SAME_...); and three registers: INT_ENABLE, one that is not used, INT_STATUS.
-HEAD = const(6)
-QUIET = const(0)
-CHANGES = const(1)
-SAME = const(2)
-ENABLED = const(3)
-STATUS = const(5)
-VARIED = const(64)
-SAME_SEEN = const(1)
-SAME_TAKEN = const(2)
+_HEAD = const(6)
+_QUIET = const(0)
+_CHANGES = const(1)
+_SAME = const(2)
+_ENABLED = const(3)
+_STATUS = const(5)
+_VARIED = const(64)
+_SAME_SEEN = const(1)
+_SAME_TAKEN = const(2)
 
 
 def make_buffer(length):
     """A buffer for samples of `length` bytes in all."""
-    buffer = bytearray(HEAD + length)
-    buffer[ENABLED] = _DATA_RDY
-    buffer[STATUS] = 0xFF
+    buffer = bytearray(_HEAD + length)
+    buffer[_ENABLED] = _DATA_RDY
+    buffer[_STATUS] = 0xFF
     return buffer
 
 
@@ -54,12 +54,12 @@ def unpack(buffer: ptr8, at: int, counts: ptr16) -> int:
     """Big-endian accel, temperature, gyro at buffer[at..at+13] into counts; returns the flags.
 
     0: the sample is not an ordinary one, and counts are as they were. Either INT_STATUS before the first packet is
-    not exactly DATA_RDY, or INT_ENABLE lacks it. Or all words are the same as before: then buffer[SAME] is SAME_SEEN,
-    and with SAME_TAKEN there the sample is taken all the same. Afterwards INT_STATUS is 0xff, which is not a status: so
-    a transfer that does not fill the buffer gives no sample.
+    not exactly DATA_RDY, or INT_ENABLE lacks it. Or all words are the same as before: then buffer[_SAME] is _SAME_SEEN,
+    and with _SAME_TAKEN there the sample is taken all the same. Afterwards INT_STATUS is 0xff, which is not a status:
+    so a transfer that does not fill the buffer gives no sample.
     """
-    if at == HEAD:
-        if buffer[STATUS] != 1 or buffer[ENABLED] & 1 == 0:
+    if at == _HEAD:
+        if buffer[_STATUS] != 1 or buffer[_ENABLED] & 1 == 0:
             return 0
     flags = 1
     changed = 0
@@ -79,32 +79,26 @@ def unpack(buffer: ptr8, at: int, counts: ptr16) -> int:
     changed |= (counts[9] ^ word) & 0xFFFF
     counts[9] = word
     if changed:
-        buffer[QUIET] = 0
-        if buffer[CHANGES] < VARIED:
-            buffer[CHANGES] += 1
-    elif buffer[SAME] != SAME_TAKEN:
-        buffer[SAME] = SAME_SEEN
+        buffer[_QUIET] = 0
+        if buffer[_CHANGES] < _VARIED:
+            buffer[_CHANGES] += 1
+    elif buffer[_SAME] != _SAME_TAKEN:
+        buffer[_SAME] = _SAME_SEEN
         return 0
-    buffer[SAME] = 0
-    buffer[STATUS] = 0xFF
+    buffer[_SAME] = 0
+    buffer[_STATUS] = 0xFF
     counts[10] = flags
     return flags
 
 
 @micropython.viper
-def _blank(buffer: ptr8):
-    """Write what no packet can be, -1 in every word, where the first one will be."""
-    i = HEAD
-    while i < HEAD + _PACKET:
-        buffer[i] = 0xFF
-        i += 1
-
-
-@micropython.viper
-def _is_blank(buffer: ptr8) -> int:
-    i = HEAD
-    while i < HEAD + _PACKET:
-        if buffer[i] != 0xFF:
+def _blank(buffer: ptr8, write: int) -> int:
+    """Write what no packet can be, -1 in every word, where the first one will be; or look whether it is there."""
+    i = _HEAD
+    while i < _HEAD + _PACKET:
+        if write:
+            buffer[i] = 0xFF
+        elif buffer[i] != 0xFF:
             return 0
         i += 1
     return 1
@@ -131,7 +125,7 @@ class Fifo:
         self.lost = 0
         self.batch = 0  # packets that one poll fetches at most
         self.device = None
-        self.buffer = make_buffer(0)  # the packets of the batch, from HEAD on
+        self.buffer = make_buffer(0)  # the packets of the batch, from _HEAD on
         self._views = ()
         self._full = 0  # packets from which on the FIFO counts as full
         self._pending = 0  # packets of the batch not yet delivered
@@ -147,8 +141,8 @@ class Fifo:
         self._byte = bytearray(1)
         self._pair = bytearray(2)
         self._status = bytearray(1)
-        self._proof = (
-            _DATA_RDY  # the bit of INT_STATUS that proves INT_ENABLE to be set, see distrust()
+        self.proof = (
+            _DATA_RDY  # the bit of INT_STATUS that proves INT_ENABLE to be set; 0: none does
         )
         self._read_into = registers.read_into
         self._write = registers.write
@@ -162,10 +156,10 @@ class Fifo:
         if not isinstance(batch, int) or not 1 <= batch <= self.size // size:
             raise ValueError(f"batch {batch!r} is not 1 to {self.size // size}")
         self._full = self.size // size - 1
-        if len(self.buffer) != HEAD + batch * size or batch != self.batch:
+        if len(self.buffer) != _HEAD + batch * size or batch != self.batch:
             self.buffer = make_buffer(batch * size)
             whole = memoryview(self.buffer)
-            self._views = [whole[HEAD : HEAD + n * size] for n in range(batch + 1)]
+            self._views = [whole[_HEAD : _HEAD + n * size] for n in range(batch + 1)]
             self.batch = batch
         self.stop()
 
@@ -179,10 +173,6 @@ class Fifo:
         self._pending = self.level = self._left = 0
         self._counted_us = ticks_us()  # set-up takes time that no filter has to make up for
         self._monitor.fifo_misaligned = 1
-
-    def distrust(self, data_ready_always):
-        """Whether the chip sets DATA_RDY without INT_ENABLE, too: then it proves nothing."""
-        self._proof = 0 if data_ready_always else _DATA_RDY
 
     # The tick: nothing below allocates, waits, raises or uses a float. The functions are small for the reason
     # given in mpu_monitor.py.
@@ -249,11 +239,8 @@ class Fifo:
 
     def _again(self, at):
         """The packet is the same as the one before."""
-        if self._monitor.same(self.buffer):
-            return unpack(self.buffer, at, self._counts)
-        return 0
+        return self._monitor.same(self.buffer) and unpack(self.buffer, at, self._counts)
 
-    @micropython.native
     def bytes_waiting(self):
         """FIFO_COUNT; -1 when the bus fails."""
         self._pair[0] = 0xFF  # more than any FIFO holds, should the transfer not fill it
@@ -279,8 +266,8 @@ class Fifo:
             self.level -= n
             self._left = self.level
             self._counted_us = self._now_us
-            self._at = HEAD
-            self.buffer[STATUS] = _DATA_RDY  # for unpack()
+            self._at = _HEAD
+            self.buffer[_STATUS] = _DATA_RDY  # for unpack()
             self._pending = n
             return n
         if self._status[0] & _FIFO_OFLOW:
@@ -296,30 +283,32 @@ class Fifo:
         """Count lost packets."""
         self.lost = (self.lost + n) & _COUNT_MASK
 
-    @micropython.native
     def _fetch(self, n):
         """Read n packets in one burst; 1 if nothing has shifted or replaced them by its end."""
         # A transfer may leave its buffer as it was and raise nothing, see mpu_monitor.py
-        self._status[0] = 0
-        _blank(self.buffer)
+        self._status[0] = 0xFF
+        _blank(self.buffer, 1)
         try:
             self._read_into(_FIFO_R_W, self._views[n])
-            self._status[0] = 0xFF
             self._read_into(_INT_STATUS, self._status)
-            if self._status[0] & _NO_STATUS or _is_blank(self.buffer):
-                self._status[0] = 0
-                self._monitor.fault()
-                return 0
-            if self._status[0] & _FIFO_OFLOW:
-                return 0
-            # DATA_RDY since the last read proves that INT_ENABLE is still set, so there was no reset.
-            # Without it, check: a FIFO that a reset has emptied repeats its last byte.
-            if self._status[0] & self._proof:
-                return 1
-            self._byte[0] = 0xFF
+        except OSError:
+            self._status[0] = 0xFF
+        if self._status[0] & _NO_STATUS or _blank(self.buffer, 0):
+            self._status[0] = 0
+            self._monitor.fault()
+            return 0
+        if self._status[0] & _FIFO_OFLOW:
+            return 0
+        # DATA_RDY since the last read proves that INT_ENABLE is still set, so there was no reset.
+        # Without it, check: a FIFO that a reset has emptied repeats its last byte.
+        return self._status[0] & self.proof or self._runs()
+
+    def _runs(self):
+        """Is USER_CTRL as it was written?"""
+        self._byte[0] = 0xFF
+        try:
             self._read_into(_USER_CTRL, self._byte)
         except OSError:
-            self._status[0] &= _FIFO_OFLOW
             self._monitor.fault()
             return 0
         # the whole register: a chip that fails now leaves the bus high, 0xff
@@ -330,34 +319,31 @@ class Fifo:
 
     def restart(self):
         """Empty the FIFO; True if that worked. On the MPU6050 FIFO_RESET works only while FIFO_EN is 0 (RM 4.27)."""
-        user_ctrl = self._table.last() & ~_FIFO_ENABLE
+        n = self._table.last() & ~_FIFO_ENABLE
         try:
-            self._write(_USER_CTRL, user_ctrl)
-            self._write(_USER_CTRL, user_ctrl | _FIFO_RESET)
+            self._write(_USER_CTRL, n)
+            self._write(_USER_CTRL, n | _FIFO_RESET)
             self._read_into(_INT_STATUS, self._byte)  # an overflow of the past
             # a port may swallow that the chip has refused the write: see mpu_monitor.py
             if self.bytes_waiting() != 0:
                 return False
-            self._write(_USER_CTRL, user_ctrl | _FIFO_ENABLE)
+            self._write(_USER_CTRL, n | _FIFO_ENABLE)
         except OSError:
             self._monitor.fault()
             return False
         self._monitor.fifo_misaligned = 0
         self.resets = (self.resets + 1) & _COUNT_MASK
-        self._lose_all()
-        return True
-
-    def _lose_all(self):
-        """Count what was in the FIFO at the last look, and what the chip has sampled since."""
-        now = ticks_us()
+        # Lost is what was in the FIFO at the last look, and what the chip has sampled since
+        self._now_us = ticks_us()
         if self.on:
-            passed = ticks_diff(now, self._counted_us)
-            if not 0 <= passed <= _MOST_LOST_US:
-                passed = _MOST_LOST_US
-            self.level = self._left + (passed + (self.period_us >> 1)) // self.period_us
+            n = ticks_diff(self._now_us, self._counted_us)
+            if not 0 <= n <= _MOST_LOST_US:
+                n = _MOST_LOST_US
+            self.level = self._left + (n + (self.period_us >> 1)) // self.period_us
         self.lose(self.level)
         self.level = self._left = 0
-        self._counted_us = now
+        self._counted_us = self._now_us
+        return True
 
 
 class Counters:
@@ -366,10 +352,6 @@ class Counters:
     @property
     def errors(self):
         return self.monitor.errors
-
-    @property
-    def frozen(self):
-        return self.monitor.frozen
 
     @property
     def resets(self):

@@ -201,23 +201,23 @@ class Monitor:
             return HEALTH_BUS_ERROR
         return self._differs(row)
 
-    @micropython.native
     def _differs(self, row):
         """The register has another value: has the chip been reset, or did the bus fail?"""
-        byte = self._byte
-        byte[0] = self._table.values[row]  # the second time the other way round
-        try:
-            self._read_into(self._table.numbers[row], byte)
-            if self._wrong(row):
-                # does the chip answer, or is the bus floating?
-                byte[0] = ~self.who_am_i & 0xFF
-                self._read_into(_WHO_AM_I, byte)
-                if byte[0] == self.who_am_i:
-                    return HEALTH_MISMATCH
-        except OSError:
-            pass
+        self._byte[0] = self._table.values[row]  # the second time the other way round
+        if self._ask(self._table.numbers[row]) and self._wrong(row):
+            # does the chip answer, or is the bus floating?
+            self._byte[0] = ~self.who_am_i & 0xFF
+            if self._ask(_WHO_AM_I) and self._byte[0] == self.who_am_i:
+                return HEALTH_MISMATCH
         self.fault()
         return HEALTH_BUS_ERROR
+
+    def _ask(self, register):
+        try:
+            self._read_into(register, self._byte)
+            return 1
+        except OSError:
+            return 0
 
     def _wrong(self, row):
         return (self._byte[0] ^ self._table.values[row]) & self._table.masks[row]

@@ -5,7 +5,7 @@
 import time
 from array import array
 
-from upright.mpu_fifo import HEAD, SAME, SAME_TAKEN, STATUS, make_buffer, unpack
+from upright.mpu_fifo import make_buffer, unpack
 
 _SMPLRT_DIV = 0x19
 _CONFIG = 0x1A
@@ -15,6 +15,11 @@ _ACCEL_CONFIG2 = 0x1D
 _FIFO_EN = 0x23
 _INT_STATUS = 0x3A
 _PWR_MGMT_1 = 0x6B
+# The head of a buffer, see mpu_fifo.py
+_HEAD = 6
+_SAME = 2
+_STATUS = 5
+_SAME_TAKEN = 2
 _ALL_AXES = 0xE0  # XG_ST, YG_ST, ZG_ST and XA_ST, YA_ST, ZA_ST
 _PRECISION = 16  # trims are in LSB times 2**16
 
@@ -115,19 +120,19 @@ def _sums(imu, actuators, ranges, samples):
     sums = [0] * 6
     counts = array("h", bytes(22))
     raw = make_buffer(14)
-    burst = memoryview(raw)[STATUS:]
+    burst = memoryview(raw)[_STATUS:]
     for _ in range(samples):
         # a sample a millisecond; a chip that gives none is not waited for without end
         for _ in range(20):
             time.sleep_ms(1)
             imu.registers.read_registers(_INT_STATUS, burst)
-            if raw[STATUS] & 1:
+            if raw[_STATUS] & 1:
                 break
         else:
             raise imu.error_class("no sample in 20 ms during the self-test")
-        raw[STATUS] = 1  # not what else INT_STATUS said
-        raw[SAME] = SAME_TAKEN
-        unpack(raw, HEAD, counts)
+        raw[_STATUS] = 1  # not what else INT_STATUS said
+        raw[_SAME] = _SAME_TAKEN
+        unpack(raw, _HEAD, counts)
         for i in range(6):
             sums[i] += counts[i]
     return sums

@@ -75,10 +75,6 @@ class I2CRegisters(Registers):
         if not hasattr(i2c, "readfrom_mem_into"):
             raise TypeError(f"{i2c!r} is not an I2C bus")
         if not isinstance(address, int) or not 0x08 <= address <= 0x77:
-            if isinstance(address, int) and 0x78 <= address <= 0xEF:
-                raise ValueError(
-                    f"address 0x{address:02x} is the 8-bit form, as modules print it: pass 0x{address >> 1:02x}"
-                )
             raise ValueError(f"address {address!r} is not an int, 0x08 to 0x77")
         self.address = address
         self.bus = i2c

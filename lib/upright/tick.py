@@ -204,8 +204,7 @@ class Tick:
         self._coasted_ahead = 0
         # Steps still to be coasted through: of missed ticks (then _coasted_ahead is not 0), or of packets that the FIFO
         # has lost, of which so many were known at the last tick
-        self._owed = 0
-        self._lost = imu.fifo_lost
+        self._owed = self._lost = 0
         self._running = False
         self._seen = -1
         self._state = array("i", [0] * _WORDS)
@@ -266,13 +265,7 @@ class Tick:
             n = imu.fifo_poll()
             well = n > 0 or ticks_diff(ticks_us(), began) < _TIME_OUT_US
             if n == 0:
-                if well:
-                    self._look_after()
-                if self._black_box is not None:
-                    self._black_box.look()
-                lost = imu.fifo_lost
-                self._owed += (lost - self._lost) & _WRAP
-                self._lost = lost
+                self._no_packet(well)
             if self._owed > 0:
                 self._make_up()
             while n > 0:
@@ -287,6 +280,15 @@ class Tick:
         except BaseException as error:
             self._crashed(error)
         self._running = False
+
+    def _no_packet(self, well):
+        if well:
+            self._look_after()
+        if self._black_box is not None:
+            self._black_box.look()
+        lost = self._imu.fifo_lost
+        self._owed += (lost - self._lost) & _WRAP
+        self._lost = lost
 
     @micropython.native
     def _on_guard(self, source):
@@ -310,7 +312,6 @@ class Tick:
             self._crashed(error)
         self._running = False
 
-    @micropython.native
     def _look_after(self):
         """Check the chip from a tick that comes rarely: it restores several registers at once."""
         n = _REPAIRS
@@ -374,27 +375,19 @@ class Tick:
     def _coast(self, lost):
         self.missed = (self.missed + lost) & _WRAP
         self._due = ticks_add(self._due, lost * self._period)
-        owed = self._owed + lost
-        lost = owed if owed < _MOST_COASTS else _MOST_COASTS
-        owed -= lost
-        most = _MOST_US // self._period
-        self._owed = owed if owed < most else most
-        self._coasted_ahead = lost
-        self._counts[10] &= ~_ANY_FRESH
-        while lost > 0:
-            self._filter.update(self._counts)
-            lost -= 1
+        self._owed += lost
+        self._coasted_ahead = self._make_up()
+        self._owed = min(self._owed, _MOST_US // self._period)
 
     def _make_up(self):
-        """Coast through packets that the FIFO has lost, a bounded number a tick."""
-        n = self._owed
-        if n > _MOST_COASTS:
-            n = _MOST_COASTS
+        """Coast through steps that are owed, a bounded number a tick; returns how many."""
+        done = n = min(self._owed, _MOST_COASTS)
         self._owed -= n
         self._counts[10] &= ~_ANY_FRESH
         while n > 0:
             self._filter.update(self._counts)
             n -= 1
+        return done
 
     @micropython.native
     def _step(self):
@@ -415,7 +408,6 @@ class Tick:
                 self._imu.health()
         return True
 
-    @micropython.native
     def _without_sample(self):
         well = not self._period or not self._late()
         if well:

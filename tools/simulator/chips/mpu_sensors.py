@@ -80,6 +80,9 @@ class Sensors(Faults):
             # world rows carry the MPU6050's temperature word, raw / 340 + 36.53
             lsb, zero = (32680, 2500) if self._identity == 0x98 else (33387, 2100)
             words[3] = _scaled(100 * words[3] + 340 * (3653 - zero), lsb, 340 * 10_000)
+        if world.ended(us):
+            # the last row for ever; but a sensor's noise does not end with the recording
+            words[3] ^= self._done * 0x9E3779B1 >> 16 & 1
         old = self._words
         standby = r[_PWR_MGMT_2]
         for i in range(3):
