@@ -450,6 +450,54 @@ def test_a_program_with_asyncio_gets_readings_step_by_step_beside_its_other_task
     assert sum(words[:2] == ["other", "task"] for words in said) >= 1
 
 
+INTERRUPTED = b"""
+import upright
+imu = upright.start(measure_bias=False, keep_bias=False, log=None)
+print("started")
+caught = 0
+def until_interrupted():
+    try:
+        while True:
+            imu.angles()
+    except KeyboardInterrupt:
+        pass
+while True:
+    try:
+        while True:
+            until_interrupted()
+            caught += 1
+    except KeyboardInterrupt:
+        pass
+"""
+
+
+def test_three_hundred_ctrl_c_never_end_the_tick(image, version):
+    """They come at any time, also in the hard interrupt. Where one lands in the second handler it ends the
+    program, and the tick goes on beside the prompt."""
+    files = emulated.project(version)
+    files["main.py"] = INTERRUPTED
+    board = rp2040.Board(image, files)
+    world = StillWorld((0, 0, 4096))
+    bus = board.i2c(0, sda=4, scl=5)
+    bus.add(MPU6050Chip(world))
+    board.boot()
+    board.start(world)
+    board.expect("started", 20)
+    for i in range(300):
+        board.send(b"\x03")
+        board.run(0.003 + 0.00013 * (i % 40))  # 5 ms is the tick's period
+    before = bus.transfers
+    board.run(0.5)
+    assert bus.transfers - before >= 95
+    board.interrupt()
+    assert board.eval("imu.tick.crashes") == 0
+    assert board.eval("caught") > 20
+    steps = board.eval("imu.tick.steps")
+    board.run(0.2)
+    assert board.eval("imu.tick.steps") - steps >= 38
+    board.exec("imu.stop()")
+
+
 # ---------------------------------------------------------------- the bench: the emulated board itself
 class Register:
     """A chip of 256 registers, on I2C and SPI, that takes notes."""

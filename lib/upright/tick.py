@@ -58,7 +58,11 @@ _TIME_OUT_US = const(2500)
 # Attempts to read one set. If 100 steps cut into as many, the tick leaves no time for a program
 _TRIES = const(100)
 
-# _running: False, True from the beginning of a tick on, and this after its step
+# Words of _marks. They are no attributes: to store one takes 2000 instructions, as the class has properties.
+_RUNNING = const(0)  # 0 between two ticks
+_DUE = const(1)  # when the next tick is due, ticks_us
+# _RUNNING from the beginning of a tick on, and after its step
+_BEGUN = const(1)
 _STEPPED = const(2)
 
 # What _publish returns
@@ -199,13 +203,12 @@ class Tick:
         self._chunk = chunk
         self._period = period_us
         self._phase_gain_shift = phase_gain_shift
-        self._due = ticks_us()
+        self._marks = array("i", [0, ticks_us()])
         self._started = False
         self._coasted_ahead = 0
         # Steps still to be coasted through: of missed ticks (then _coasted_ahead is not 0), or of packets that the FIFO
         # has lost, of which so many were known at the last tick
         self._owed = self._lost = 0
-        self._running = False
         self._seen = -1
         self._state = array("i", [0] * _WORDS)
         self._state[_CALLS] = 0 if on_step is None else _CALL_ON_STEP
@@ -225,23 +228,16 @@ class Tick:
         self.step_errors = 0
         self.step_error = None
         self.interrupt = None
-        # Methods that ticks call are looked up once, see mpu_monitor.Monitor. (With all of these the table of
-        # attributes has grown to its next size, 47, and is far from full.)
-        self._on_time = self._on_time
-        self._step = self._step
-        self._call_on_step = self._call_on_step
-        self._without_sample = self._without_sample
-        self._crashed = self._crashed
-        self._look_after = self._look_after
         self.on_sample = self._on_sample
         self.on_fifo = self._on_fifo
         self.on_guard = self._on_guard
 
     @micropython.native
     def _on_sample(self, source):
-        if self._running:  # another source of the same tick, at a higher priority
+        marks = self._marks
+        if marks[_RUNNING]:  # another source of the same tick, at a higher priority
             return
-        self._running = True
+        marks[_RUNNING] = _BEGUN
         try:
             if self._on_time():
                 self._imu.read()
@@ -252,13 +248,14 @@ class Tick:
         except BaseException as error:
             # it must not stop the timer: it is counted, and the main program shows it
             self._crashed(error)
-        self._running = False
+        marks[_RUNNING] = 0
 
     @micropython.native
     def _on_fifo(self, source):
-        if self._running:
+        marks = self._marks
+        if marks[_RUNNING]:
             return
-        self._running = _STEPPED  # until there is a packet
+        marks[_RUNNING] = _STEPPED  # until there is a packet
         try:
             imu = self._imu
             began = ticks_us()
@@ -272,14 +269,14 @@ class Tick:
                 imu.fifo_next()  # a packet that is withheld after a reset is still a step: the filter coasts
                 if n == 1 and self._mag is not None:
                     self._mag.read(self._raw)
-                self._running = True
+                marks[_RUNNING] = _BEGUN
                 self._step()
                 n -= 1
             if well and self._display is not None:
                 self._display.flush_step(self._chunk)
         except BaseException as error:
             self._crashed(error)
-        self._running = False
+        marks[_RUNNING] = 0
 
     def _no_packet(self, well):
         if well:
@@ -294,9 +291,10 @@ class Tick:
     def _on_guard(self, source):
         """Slow timer beside the data-ready line. A chip that has reset itself no longer drives that line: it is
         detected and restored here."""
-        if self._running:
+        marks = self._marks
+        if marks[_RUNNING]:
             return
-        self._running = True
+        marks[_RUNNING] = _BEGUN
         try:
             if self._state[_STEPS] == self._seen:
                 began = ticks_us()
@@ -310,7 +308,7 @@ class Tick:
             self._seen = self._state[_STEPS]
         except BaseException as error:
             self._crashed(error)
-        self._running = False
+        marks[_RUNNING] = 0
 
     def _look_after(self):
         """Check the chip from a tick that comes rarely: it restores several registers at once."""
@@ -321,7 +319,7 @@ class Tick:
     @micropython.native
     def _crashed(self, error):
         self._count_crash(error)
-        if self._running != _STEPPED:  # a step is always one step
+        if self._marks[_RUNNING] != _STEPPED:  # a step is always one step
             try:
                 self._counts[10] &= ~_ANY_FRESH
                 self._filter.update(self._counts)
@@ -349,18 +347,19 @@ class Tick:
         period = self._period
         if period == 0:
             return True
-        due = self._due
+        marks = self._marks
+        due = marks[_DUE]
         late = ticks_diff(ticks_us(), due)
         if not self._started:
             self._started = True
-            self._due = ticks_add(due, late + period)
+            marks[_DUE] = ticks_add(due, late + period)
             return True
         if late >= period:
             self._coast(late // period)
             if self._black_box is not None:
                 self._black_box.look()
             late %= period
-            due = self._due
+            due = marks[_DUE]
         elif self._coasted_ahead:
             if late < -(period >> 1):
                 self._coasted_ahead -= 1
@@ -369,12 +368,12 @@ class Tick:
                 self._coast(0)
             elif late < period >> 1:
                 self._coasted_ahead = 0
-        self._due = ticks_add(due, period + (late >> self._phase_gain_shift))
+        marks[_DUE] = ticks_add(due, period + (late >> self._phase_gain_shift))
         return True
 
     def _coast(self, lost):
         self.missed = (self.missed + lost) & _WRAP
-        self._due = ticks_add(self._due, lost * self._period)
+        self._marks[_DUE] = ticks_add(self._marks[_DUE], lost * self._period)
         self._owed += lost
         self._coasted_ahead = self._make_up()
         self._owed = min(self._owed, _MOST_US // self._period)
@@ -398,7 +397,7 @@ class Tick:
             self._calibration.apply(self._raw)
         self._filter.update(counts)
         due = _publish(self._state, self._q, counts)
-        self._running = _STEPPED
+        self._marks[_RUNNING] = _STEPPED
         if due:
             if due & _CALL_ON_STEP:
                 self._call_on_step()
@@ -419,7 +418,7 @@ class Tick:
     @micropython.native
     def _late(self):
         """Is half of the period over?"""
-        return ticks_diff(self._due, ticks_us()) < self._period >> 1
+        return ticks_diff(self._marks[_DUE], ticks_us()) < self._period >> 1
 
     @micropython.native
     def _call_on_step(self):
@@ -450,11 +449,12 @@ class Tick:
 
     def hold(self):
         """Do nothing until resume(), should a timer still call: a Ctrl-C may have come while it was stopped."""
-        self._running = True
+        self._marks[_RUNNING] = _BEGUN
 
     def resume(self):
         """Call before stopped ticks go on: ticks of the pause are not counted as missed."""
-        self._running = self._started = False
+        self._marks[_RUNNING] = 0
+        self._started = False
         self._coasted_ahead = self._owed = 0
         self._lost = self._imu.fifo_lost
 
