@@ -114,7 +114,14 @@ class Mpu(Counters):
         self._temperature = mpu_parts.T_6050
         self._begun = False
         self._configured = False
-        # Methods that every tick calls are looked up once, see mpu_monitor.Monitor.
+        # Methods that ticks call are looked up once, see mpu_monitor.Monitor. (With all of these the table of
+        # attributes grows to its next size once configure() has set its own, and is not nearly full.)
+        self._unusual = self._unusual
+        self._withheld = self._withheld
+        self._is_sample = self._is_sample
+        self._is_due = self._is_due
+        self._has_words = self._has_words
+        self.bus_fault = self.bus_fault
         self._read_into = registers.read_into
         self.read = self.read
         self.health = self.monitor.health
