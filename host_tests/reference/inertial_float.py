@@ -422,6 +422,9 @@ class InertialFloat(FieldFloat):
                 n = 0
             if jumped or upset:
                 self.again = True
+            if upset or (
+                jumped and self.axes == 9
+            ):  # six axes: what the bias turned comes back with it
                 self.open_heading(OPEN)
         self.still = n
 
@@ -500,8 +503,8 @@ class InertialFloat(FieldFloat):
                     P[1 + i][1 + k] = P[1 + k][1 + i] = x
         x = P[0][0] - 2 * T * c + T * T * u + T * (WALK**2 + p["scale_error"] ** 2 * self.rate)
         if self.clipped:
-            # a gyro at full scale may have missed as much again
-            missed = self.clipped * 32768 * self.gyro * self.dt
+            # a gyro at full scale may have missed as much again, at least 1000 deg/s
+            missed = self.clipped * max(32768 * self.gyro, math.radians(1000)) * self.dt
             x = max(x, min(OPEN, (math.sqrt(P[0][0]) + missed) ** 2))
             self.clipped = 0
         if x > OPEN:

@@ -249,10 +249,9 @@ class Inertial9(EarthFilter):
             raise ValueError("gyro_scale is %d/%d, too fine for field_dps" % self.gyro_scale)
         s[_PACE] = max(1, -(-_PARTS >> s[_BLOCK]))  # parts in a step: all within a block
         s[_OUTAGE] = max(1, ratio(p["outage"] * num, MILLION * den))
-        # a gyro at full scale may have missed as much again: in units of 2.5 rad, Q15
-        s[_CLIP] = max(
-            1, ratio((per * 32768 * pi_num * den << 15) * 2, 180 * 5 * scale * pi_den * num)
-        )
+        # what a gyro at full scale may have missed: as much again, at least 1000 deg/s; in units of 2.5 rad, Q15
+        most = max(32768 * per, 1000 * scale)
+        s[_CLIP] = max(1, ratio((most * pi_num * den << 15) * 2, 180 * 5 * scale * pi_den * num))
         # levelling
         s[_HELD_K] = ratio(two * MILLION << 15, 2 * p["tau_start"] * num + two * MILLION)
         s[_SF_K] = ratio(two << 16, num + 2 * two)

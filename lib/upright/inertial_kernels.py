@@ -650,7 +650,8 @@ def detect_rest(state):
             decided |= _UPSET_BIT
             s[_AGAIN] = 1
             n = 0
-        if decided & (_JUMPED | _UPSET_BIT):
+        # six axes: what the bias turned comes back with it, as P knows
+        if decided & _UPSET_BIT or (decided & _JUMPED and s[_NINE]):
             open_heading(state, _OPEN)
     s[_WAIT] = wait
     s[_STILL] = n
