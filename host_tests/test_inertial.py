@@ -396,9 +396,9 @@ def disturb(rng, filter):
     word("LOST", 0, s[AT.RESTART_AFTER])
     word("FOR", 0, s[AT.FOR_MOST])
     word("FO_FOR", 0, s[AT.FOR_MOST])
-    word("CAND", 0, s[AT.NEED_MOST], s[AT.FIELD_NEW], s[AT.FIELD_FIRST])
+    word("CAND", 0, 2 * s[AT.FOR_MOST] + s[AT.NEED], s[AT.FIELD_NEW], s[AT.FIELD_FIRST])
     word("BACK", 0, s[AT.BACK_AFTER])
-    word("WEIGHT", 0, 2)
+    word("WEIGHT", 0, 1)
     s[AT.DECIDED] = rng.randint(0, (1 << DECISIONS) - 1)
 
 

@@ -18,7 +18,7 @@ FORGET = 8192  # so little is known of the heading that any field will do
 
 FIELD_SMOOTH = 0.05  # s
 SAME_TOLERANCE = 0.08
-FOR_MOST, NEED, NEED_MOST, BACK_AFTER, STEADY_MOST = 60.0, 5.0, 125.0, 3.0, 1.0  # s
+FOR_MOST, NEED, BACK_AFTER, STEADY_MOST = 60.0, 5.0, 3.0, 1.0  # s
 STILL_TAU, STILL_E = 5.0, 0.1  # s, rad
 CANDIDATE_E = 0.35  # rad
 FORGOTTEN = 0.3  # rad**2
@@ -100,6 +100,8 @@ class FieldFloat(EarthFloat):
         else:
             self.candidate_e = wrap(self.candidate_e + k * wrap(e - self.candidate_e))
         restart = self._own_error()
+        if good:
+            self.back = 0
         if restart:
             near, good, self.candidate_for = after, True, 0
         elif not good and near == 0:
@@ -143,7 +145,7 @@ class FieldFloat(EarthFloat):
         need, n, returns = self.pairs(p["field_first"]), self.candidate_for, False
         if r is not None:
             if not has & FORGET:
-                need = min(self.pairs(NEED_MOST), 2 * self.seen + self.pairs(NEED))
+                need = 2 * self.seen + self.pairs(NEED)
                 if has & CONSISTENT:
                     need = min(need, self.pairs(p["field_new"]))
             if has & NEAR_OLD:

@@ -56,7 +56,7 @@ import math
 
 from reference.earth_float import block_of, clamp, rows, turned, wrap
 from reference.earth_float import start as start  # for who starts the twin
-from reference.field_float import NEAR_REFERENCE, FieldFloat
+from reference.field_float import NEAR_CANDIDATE, NEAR_REFERENCE, FieldFloat
 
 # decisions, as lib/upright/inertial.py has them in its state; the others are in field_float.py
 STILL = 1  # gyro and accelerometer near their averages, and the gyro below the largest bias
@@ -112,7 +112,7 @@ FULL_MOST = 10  # samples with a gyro at full scale, after which the tilt starts
 REST_TAU = 0.25  # s
 SOON = 0.3  # s
 JUMP_DPS = 1.0
-WAIT_FIELD, WAIT_SURE = 60.0, 30.0  # s
+WAIT_SURE = 30.0  # s
 WAIT_MOVED_G = 0.03
 TURN_LEAST, TURN_MOST_SEEN = (
     0.1,
@@ -159,6 +159,7 @@ class InertialFloat(FieldFloat):
         self.low1, self.low2 = [0.0] * 6, [0.0] * 6
         self.e = self.candidate_e = self.still_e = 0.0
         self.field = self.reference = self.old = self.candidate = None
+        self.dx = [0.0] * 4
         self.near = self.seen = self.old_seen = self.candidate_for = self.back = self.steady = 0
         self.good = False
         self.weight = 0
@@ -183,6 +184,7 @@ class InertialFloat(FieldFloat):
         self.base = list(counts)
         self.b = [0.0] * 3
         self.open_bias()
+        self.dx[1:4] = [0.0] * 3
         if known_s > 0:
             for i in range(1, 4):
                 self.P[i][i] = min(self.P[i][i], math.radians(0.5) ** 2 / known_s)
@@ -412,8 +414,8 @@ class InertialFloat(FieldFloat):
         else:
             self.wait = 0
         if n == self.rest_after:
-            jumped = max(abs(v) for v in off) > math.radians(JUMP_DPS)
-            jumped = jumped and self.P[1][1] > self.bias_start**2 / 5
+            unknown = [i for i in range(3) if self.P[1 + i][1 + i] > self.bias_start**2 / 5]
+            jumped = any(abs(off[i]) > math.radians(JUMP_DPS) for i in unknown)
             jumped = self.decide(JUMPED, self.still < n and jumped)
             upset = math.hypot(*self.s[0:2]) > p["upset_g"]
             upset = not jumped and self.n > self.steps(SOON) and upset
@@ -451,7 +453,7 @@ class InertialFloat(FieldFloat):
         turned = turned > (WAIT_MOVED_G * self.lsb) ** 2
         adopt = False
         if not turned and known and self.wait >= self._patience(min(known)):
-            if self._field_known() and self.decided & NEAR_REFERENCE:
+            if self._field_known() and self.decided & (NEAR_REFERENCE | NEAR_CANDIDATE):
                 # what the gyro says the heading turned by; the magnetometer knows better
                 moved = abs(wrap(self.e - self.wait_e) + self.wait_turn)
                 sure = self.wait >= self.pairs(WAIT_SURE)
@@ -459,7 +461,9 @@ class InertialFloat(FieldFloat):
                     turned = turn >= 2 * TURN_LEAST or (sure and moved < turn / 2)
                 adopt = not turned and (moved >= TURN_LEAST or sure)
             else:
-                adopt = not self._field_known() or self.wait >= self.pairs(WAIT_FIELD)
+                adopt = not self._field_known() or self.wait >= max(
+                    1, self.pairs(self.p["rest_wait"])
+                )
         turned = self.decide(TURNED, turned)
         if self.decide(ADOPT, adopt):
             self.open_bias()

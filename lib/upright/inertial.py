@@ -98,56 +98,54 @@ _JUMP = const(163)
 _SOON = const(164)
 _WAIT = const(165)
 _WAIT_MOST = const(166)
-_WAIT_FIELD = const(167)
-_WAIT_SURE = const(168)
-_WAIT_TURN = const(170)
-_WAIT_MOVED = const(174)
-_GYRO = const(175)
-_B_SHIFT = const(176)
-_B_MAX = const(177)
-_B_UNIT = const(178)
-_B_INVERSE = const(179)
-_P = const(180)
-_DX = const(196)
-_P_REST = const(207)
-_P_KNOWN = const(208)
-_P_VAGUE = const(209)
-_P_SET = const(210)
-_Q_HEADING = const(211)
-_Q_SCALE = const(212)
-_Q_SCALE_SHIFT = const(213)
-_Q_LEVEL = const(214)
-_Q_UP = const(215)
-_GROW = const(216)
-_R_TILT = const(217)
-_R_REST = const(218)
-_R_MAG = const(219)
-_CC = const(223)
-_C = const(224)
-_FOR_MOST = const(237)
-_BACK_AFTER = const(241)
-_STILL_SET = const(244)
-_STILL_K = const(245)
-_STEADY_MOST = const(247)
-_OWN = const(248)
-_LOST = const(249)
-_RESTART_AFTER = const(250)
-_WEIGHT = const(251)
-_TOL = const(252)
-_SAME = const(253)
-_SMOOTH = const(254)
-_REF = const(255)
-_FIELD_AFTER = const(256)
-_FIELD_FIRST = const(257)
-_FIELD_NEW = const(258)
-_NEED = const(259)
-_NEED_MOST = const(260)
-_TURNING_MIN = const(261)
-_GATE = const(262)
-_DOUBT = const(264)
-_GAP = const(265)
-_LAST = const(266)
-_WORDS = const(269)
+_WAIT_SURE = const(167)
+_WAIT_TURN = const(169)
+_WAIT_MOVED = const(173)
+_GYRO = const(174)
+_B_SHIFT = const(175)
+_B_MAX = const(176)
+_B_UNIT = const(177)
+_B_INVERSE = const(178)
+_P = const(179)
+_DX = const(195)
+_P_REST = const(206)
+_P_KNOWN = const(207)
+_P_VAGUE = const(208)
+_P_SET = const(209)
+_Q_HEADING = const(210)
+_Q_SCALE = const(211)
+_Q_SCALE_SHIFT = const(212)
+_Q_LEVEL = const(213)
+_Q_UP = const(214)
+_GROW = const(215)
+_R_TILT = const(216)
+_R_REST = const(217)
+_R_MAG = const(218)
+_CC = const(222)
+_C = const(223)
+_FOR_MOST = const(236)
+_BACK_AFTER = const(240)
+_STILL_SET = const(243)
+_STILL_K = const(244)
+_STEADY_MOST = const(246)
+_OWN = const(247)
+_LOST = const(248)
+_RESTART_AFTER = const(249)
+_WEIGHT = const(250)
+_TOL = const(251)
+_SAME = const(252)
+_SMOOTH = const(253)
+_REF = const(254)
+_FIELD_AFTER = const(255)
+_FIELD_FIRST = const(256)
+_FIELD_NEW = const(257)
+_NEED = const(258)
+_TURNING_MIN = const(259)
+_GATE = const(260)
+_DOUBT = const(262)
+_GAP = const(263)
+_LAST = const(264)
+_WORDS = const(267)
 # -- end of the words
 
 _HALF = const(536870912)  # 1/2, Q30: no variance is more
@@ -192,8 +190,8 @@ class Inertial9(EarthFilter):
         "tau_start": (2.4, 0.5, 30),  # time constant of the tilt correction while little is known of the bias
         "tau_fast": (3.2, 0.5, 30),  # its least afterwards ...
         "tau_slow": (20, 1, 100),  # ... and its most
-        "tau_turning": (4.4, 0.5, 50),  # between them it falls with the root of the turn rate: this is it at 100 deg/s
-        "ramp_tilt": (0.65, 0.1, 4),  # at the start it is this times the time since, in 1/256
+        "tau_turning": (4.4, 0.5, 50),  # between them it falls with the root of the turn rate: at 100 deg/s
+        "ramp_tilt": (0.65, 0.1, 4),  # at the start the time constant is this times the time since
         "accel_doubt_g": (0.16, 0.1, 2),  # a deviation of so much halves what the tilt tells about the bias
         "bias_after": (0.3, 0, 60),  # no bias estimation in motion before this time ...
         "bias_full": (7, 0.5, 60),  # ... and at less than full weight before this
@@ -216,7 +214,7 @@ class Inertial9(EarthFilter):
         "field_after": (0.3, 0, 10),  # for this long
         "field_tau": (33, 1, 100),  # time constant with which the reference follows
         "field_first": (5, 0, 100),  # a field that stays the same for this long is the first reference
-        "field_new": (20, 1, 1000),  # the same for another one with the same heading, counted while turning
+        "field_new": (20, 1, 125),  # the same for another one with the same heading, counted while turning
         "field_dps": (20, 1, 30),  # turning: faster than this, deg/s
         "field_gate": (0.3, 0.05, 3),  # a heading error that is believed, beside what the gyro may be off by
         "restart_after": (8, 0.5, 100),  # a larger one in the same field restarts the heading after this; at rest twice
@@ -285,7 +283,6 @@ class Inertial9(EarthFilter):
         s[_JUMP] = counts(MILLION, 4096)
         s[_UPSET] = ratio(p["upset_g"] * lsb, 4 * MILLION) ** 2
         s[_WAIT_MOST] = max(1, pairs(p["rest_wait"]))
-        s[_WAIT_FIELD] = pairs(60 * MILLION)
         s[_WAIT_SURE] = pairs(30 * MILLION)
         s[_WAIT_MOVED] = ratio(3 * lsb, 400) ** 2
         s[_GYRO] = ratio(per * two * pi_num << 28, 180 * scale * num * pi_den)
@@ -329,7 +326,6 @@ class Inertial9(EarthFilter):
         s[_FIELD_NEW] = pairs(p["field_new"])
         s[_FOR_MOST] = pairs(60 * MILLION)
         s[_NEED] = pairs(5 * MILLION)
-        s[_NEED_MOST] = pairs(125 * MILLION)
         s[_BACK_AFTER] = pairs(3 * MILLION)
         s[_STEADY_MOST] = max(1, pairs(MILLION))
         s[_STILL_K] = ratio(two << 15, 5 * num + two)
@@ -350,6 +346,7 @@ class Inertial9(EarthFilter):
             (_C, 2),
             (_LAST, 3),
             (_GG, 3),
+            (_GS, 3),
         ):
             for i in range(n):
                 s[first + i] = 0
@@ -387,6 +384,8 @@ class Inertial9(EarthFilter):
         if known_s > 0:  # 0.5 deg/s / known_s**0.5
             variance = fixmath.ratio(s[_P_SET] * MILLION, fixmath.quantise(known_s, "known_s"))
             variance = min(_HALF, max(64, variance))
+        for i in range(1, 4):
+            s[_DX + i] = 0  # it belongs to the old one
         for i in (5, 10, 15):
             s[_P + i] = variance
         s[_WAIT] = 0
@@ -399,7 +398,7 @@ class Inertial9(EarthFilter):
     def mag_accepted(self):
         """True while the magnetometer corrects the heading; False if its field is rejected or absent."""
         s = self.state
-        return s[_WEIGHT] == 2 and s[_SINCE] < 16 and s[_N] > 0 and bool(s[_NINE])
+        return s[_WEIGHT] == 1 and s[_SINCE] < 16 and s[_N] > 0 and bool(s[_NINE])
 
     @property
     def heading_uncertainty_mdeg(self):
@@ -468,11 +467,11 @@ class Inertial9(EarthFilter):
         s[_LAST + 1] = n
         s[_LAST + 2] = o
         r = gain * o - fine * n
-        x += (u >> 15) + (r >> 8) * 85
+        x += (u >> 15) + (r + 128 >> 8) * 85
         r = fine * m - i * o
-        y += (v >> 15) + (r >> 8) * 85
+        y += (v >> 15) + (r + 128 >> 8) * 85
         r = i * n - gain * m
-        z += (w >> 15) + (r >> 8) * 85
+        z += (w >> 15) + (r + 128 >> 8) * 85
         if fresh and s[_TURN] | s[_TURN + 1] | s[_TURN + 2]:
             # + R' TURN, the last correction, from the earth into the body
             i = 0

@@ -43,7 +43,7 @@ _LEVEL_MASK = const(96)  # steps of it less 1
 _REGRESS = const(97)  # 1: the regressors take their step next
 _PART = const(98)  # part of the work of two blocks that comes next
 _GG = const(100)  # 3: gyro counts summed over two blocks
-_CLIPPED = const(105)  # samples with one in this block
+_CLIPPED = const(105)  # samples with one since P grew last
 _CLIP = const(106)  # Q15: what one adds to the doubt of the heading, units of 2.5 rad
 _SEEN = const(108)  # 3, Q12: the gyro of one sample, less BASE
 _H = const(111)  # 3, Q14: specific force of the block in the earth frame, counts
@@ -71,7 +71,7 @@ _K_PACE = const(138)  # Q20: tilt gain of a block after the start
 _K_START = const(139)  # Q20: tilt gain of a block while little is known of the bias ...
 _K_LEAST = const(140)  # Q20: ... and its bounds afterwards
 _K_MOST = const(141)  # Q20
-_K_TURN = const(142)  # tilt gain for the fourth root of HELD: K_TURN / 2**18
+_K_TURN = const(142)  # tilt gain for the fourth root of HELD: K_TURN / 2**22
 _NORM = const(143)  # shift that brings 1 g to 2**14..2**15 counts
 _G1 = const(144)  # 1 g in counts
 _LI = const(145)  # Q29: 1 / (1 g, normalised)
@@ -86,75 +86,73 @@ _JUMP = const(163)  # Q12: a bias found at rest that restarts the ramp, counts
 _SOON = const(164)  # steps after a restart in which no other follows
 _WAIT = const(165)  # blocks for which a rest has contradicted the bias
 _WAIT_MOST = const(166)  # blocks
-_WAIT_FIELD = const(167)  # blocks that the magnetometer is waited for
-_WAIT_SURE = const(168)  # blocks after which a slow turn is decided, too
-_WAIT_E = const(169)  # Q28: the heading error at their start, rad
-_WAIT_TURN = const(170)  # Q28: corrections of the heading since, rad
-_WAIT_A = const(171)  # 3, Q12: accelerometer at their start, counts
-_WAIT_MOVED = const(174)  # how far it may be from there: counts**2 / 16
-_GYRO = const(175)  # Q28: the angle of a count in one block, rad
-_B_SHIFT = const(176)  # B is in counts, Q(B_SHIFT)
-_B_MAX = const(177)  # its bound
-_B_UNIT = const(178)  # the unit of P's biases in B's, / 2**13
-_B_INVERSE = const(179)  # 2**20 counts / this unit
-_P = const(180)  # 16, Q30: covariance of heading (2.5 rad) and bias (bias_start * 2**0.5), 4 x 4
-_DX = const(196)  # 4, Q27: their correction in this block
-_INNOVATION = const(200)  # Q27: what is measured of ROW . (heading, bias), less what DX says ...
-_NOISE = const(201)  # Q20: ... its variance ...
-_Z = const(202)  # 4, Q30: ... P ROW ...
-_TOTAL = const(206)  # Q30: ... and ROW P ROW
-_P_REST = const(207)  # Q30: variance of a bias of 1 block of rest
-_P_KNOWN = const(208)  # Q30: variance of a bias that is known ...
-_P_VAGUE = const(209)  # Q30: ... and of one of which little is known
-_Q_HEADING = const(211)  # Q30: variance that a block adds to the heading ...
-_Q_SCALE = const(212)  # ... and for RATE: Q_SCALE / 2**Q_SCALE_SHIFT
-_Q_SCALE_SHIFT = const(213)
-_Q_LEVEL = const(214)  # Q30: variance that a block adds to a horizontal bias ...
-_Q_UP = const(215)  # Q30: ... and to a vertical one
-_GROW = const(216)  # Q20: heading that a unit of bias makes in a block
-_R_TILT = const(217)  # Q20: variance of a tilt correction as a bias
-_R_REST = const(218)  # Q20: variance of the gyro at rest
-_R_MAG = const(219)  # Q20: variance of a heading
-_SHARE = const(220)  # Q15: how much of what the measurement says of the bias is believed
-_AXIS = const(221)  # of the gyro that was measured last, at rest
-_SIDE = const(222)  # which tilt correction comes next: 0 north, 1 west
-_CC = const(223)  # TURN to INNOVATION: CC / 2**10
-_C = const(224)  # 2, Q31: TURN of the last levelling, north and west
-_HAVE = const(226)  # 1: field and candidate are set; 2: reference, too; 4: the one before, too
-_F = const(227)  # 2, Q13: smoothed field, counts, horizontal and vertical
-_FR = const(229)  # 2, Q13: reference; F, FR, FO and FC stand together
-_FO = const(231)  # 2, Q13: the reference before this one
-_FC = const(233)  # 2, Q13: candidate
-_NEAR = const(235)  # blocks near the reference, no more than FIELD_AFTER
-_FOR = const(236)  # blocks for which the reference was seen while turning
-_FOR_MOST = const(237)  # most of it
-_FO_FOR = const(238)  # the same of the reference before
-_CAND = const(239)  # the same of the candidate
-_BACK = const(240)  # blocks near the reference before
-_BACK_AFTER = const(241)  # blocks
-_CAND_E = const(242)  # Q28: heading error in the candidate's field, rad
-_STILL_E = const(243)  # Q28: slow mean of the heading error at rest, rad
-_STILL_SET = const(244)  # 1: it is set
-_STILL_K = const(245)  # Q15: its gain
-_STEADY = const(246)  # blocks with the field near to the reference, no more than STEADY_MOST
-_STEADY_MOST = const(247)  # blocks
-_OWN = const(248)  # 1: the heading error is the attitude's own, not another field's
-_LOST = const(249)  # half blocks of such an error
-_RESTART_AFTER = const(250)  # half blocks
-_WEIGHT = const(251)  # 2: the heading is taken up
-_TOL = const(252)  # Q15: tolerance squared
-_SAME = const(253)  # Q15: the same for a field that has not changed
-_SMOOTH = const(254)  # Q10: blocks of 0.05 s
-_REF = const(255)  # Q10: blocks of the reference's time constant
-_FIELD_AFTER = const(256)  # blocks
-_FIELD_FIRST = const(257)  # blocks
-_FIELD_NEW = const(258)  # blocks
-_NEED = const(259)  # blocks of 5 s
-_NEED_MOST = const(260)  # blocks
-_TURNING_MIN = const(261)  # squared turn rate, (4 counts)**2
-_GATE = const(262)  # Q28: heading error that is believed, beside the doubt, rad
-_GOOD = const(263)  # 1: the field is the reference's, and its heading is believed
-_DOUBT = const(264)  # Q28: heading uncertainty, rad
+_WAIT_SURE = const(167)  # blocks after which a slow turn is decided, too
+_WAIT_E = const(168)  # Q28: the heading error at their start, rad
+_WAIT_TURN = const(169)  # Q28: corrections of the heading since, rad
+_WAIT_A = const(170)  # 3, Q12: accelerometer at their start, counts
+_WAIT_MOVED = const(173)  # how far it may be from there: counts**2 / 16
+_GYRO = const(174)  # Q28: the angle of a count in two blocks, rad
+_B_SHIFT = const(175)  # B is in counts, Q(B_SHIFT)
+_B_MAX = const(176)  # its bound
+_B_UNIT = const(177)  # the unit of P's biases in B's, / 2**13
+_B_INVERSE = const(178)  # 2**20 counts / this unit
+_P = const(179)  # 16, Q30: covariance of heading (2.5 rad) and bias (bias_start * 2**0.5), 4 x 4
+_DX = const(195)  # 4, Q27: their correction in these two blocks
+_INNOVATION = const(199)  # Q27: what is measured of ROW . (heading, bias), less what DX says ...
+_NOISE = const(200)  # Q20: ... its variance ...
+_Z = const(201)  # 4, Q30: ... P ROW ...
+_TOTAL = const(205)  # Q30: ... and ROW P ROW
+_P_REST = const(206)  # Q30: variance of a bias after two blocks of rest
+_P_KNOWN = const(207)  # Q30: variance of a bias that is known ...
+_P_VAGUE = const(208)  # Q30: ... and of one of which little is known
+_Q_HEADING = const(210)  # Q30: variance that two blocks add to the heading ...
+_Q_SCALE = const(211)  # ... and for RATE: Q_SCALE / 2**Q_SCALE_SHIFT
+_Q_SCALE_SHIFT = const(212)
+_Q_LEVEL = const(213)  # Q30: variance that two blocks add to a horizontal bias ...
+_Q_UP = const(214)  # Q30: ... and to a vertical one
+_GROW = const(215)  # Q20: heading that a unit of bias makes in two blocks
+_R_TILT = const(216)  # Q20: variance of a tilt correction as a bias
+_R_REST = const(217)  # Q20: variance of the gyro at rest
+_R_MAG = const(218)  # Q20: variance of a heading
+_SHARE = const(219)  # Q15: how much of what the measurement says of the bias is believed
+_AXIS = const(220)  # of the gyro that was measured last, at rest
+_SIDE = const(221)  # which tilt correction comes next: 0 north, 1 west
+_CC = const(222)  # TURN to INNOVATION: CC / 2**10
+_C = const(223)  # 2, Q31: TURN of the last levelling, north and west
+_HAVE = const(225)  # 1: field and candidate are set; 2: reference, too; 4: the one before, too
+_F = const(226)  # 2, Q13: smoothed field, counts, horizontal and vertical
+_FR = const(228)  # 2, Q13: reference; F, FR, FO and FC stand together
+_FO = const(230)  # 2, Q13: the reference before this one
+_FC = const(232)  # 2, Q13: candidate
+_NEAR = const(234)  # blocks near the reference, no more than FIELD_AFTER
+_FOR = const(235)  # blocks for which the reference was seen while turning
+_FOR_MOST = const(236)  # most of it
+_FO_FOR = const(237)  # the same of the reference before
+_CAND = const(238)  # the same of the candidate
+_BACK = const(239)  # blocks near the reference before
+_BACK_AFTER = const(240)  # blocks
+_CAND_E = const(241)  # Q28: heading error in the candidate's field, rad
+_STILL_E = const(242)  # Q28: slow mean of the heading error at rest, rad
+_STILL_SET = const(243)  # 1: it is set
+_STILL_K = const(244)  # Q15: its gain
+_STEADY = const(245)  # blocks with the field near to the reference, no more than STEADY_MOST
+_STEADY_MOST = const(246)  # blocks
+_OWN = const(247)  # 1: the heading error is the attitude's own, not another field's
+_LOST = const(248)  # half blocks of such an error
+_RESTART_AFTER = const(249)  # half blocks
+_WEIGHT = const(250)  # 1: the heading is taken up
+_TOL = const(251)  # Q15: tolerance squared
+_SAME = const(252)  # Q15: the same for a field that has not changed
+_SMOOTH = const(253)  # Q10: blocks of 0.05 s
+_REF = const(254)  # Q10: blocks of the reference's time constant
+_FIELD_AFTER = const(255)  # blocks
+_FIELD_FIRST = const(256)  # blocks
+_FIELD_NEW = const(257)  # blocks
+_NEED = const(258)  # blocks of 5 s
+_TURNING_MIN = const(259)  # squared turn rate, (4 counts)**2
+_GATE = const(260)  # Q28: heading error that is believed, beside the doubt, rad
+_GOOD = const(261)  # 1: the field is the reference's, and its heading is believed
+_DOUBT = const(262)  # Q28: heading uncertainty, rad
 # -- end of the words
 
 # decisions
@@ -342,7 +340,7 @@ def pace(state):
     k = 0
     if s[_PROBE] > 0:
         k = 32
-    # HELD follows RATE up at once, down with 2 tau
+    # HELD follows RATE up at once, down with 2 tau_start
     rate = s[_RATE]
     x = s[_HELD]
     if rate > x:
@@ -540,17 +538,19 @@ def detect_rest(state):
         x = s[_LOW2 + 3 + i] << k >> k
         y = x - ((s[_B + i] << k >> k) >> shift)
         n = y
+        if n > 0xFFFF00:
+            n = 0xFFFF00
+        elif n < 0 - 0xFFFF00:
+            n = 0 - 0xFFFF00
         if y < 0:
             y = 0 - y
-        if y > 0xFFFFFF:
-            n = 0
         up += (n >> 8) * (s[_R + 6 + i] << k >> k) >> 7  # of the gyro less B, Q12
         if x < 0:
             x = 0 - x
         if x > s[_REST_MOST]:
             still = False
         x = s[_P + 5 + 5 * i]
-        if y > jump:
+        if y > jump and x > _TENTH_P:
             jump = y
         if y > s[_REST_OFF] and x < s[_P_KNOWN]:
             contradicts = True
@@ -596,10 +596,10 @@ def detect_rest(state):
             field = 0
             if s[_NINE] and s[_HAVE] & 2 and s[_SINCE] < 16:
                 field = 1
-            near = decided & _NEAR_REFERENCE
+            near = decided & (_NEAR_REFERENCE | _NEAR_CANDIDATE)
             if moved > s[_WAIT_MOVED]:
                 decided |= _TURNED
-            elif wait >= x and (field == 0 or near or wait >= s[_WAIT_FIELD]):
+            elif wait >= x and (field == 0 or near or wait >= s[_WAIT_MOST]):
                 # turn: what the gyro less B would have turned the heading by; the magnetometer knows better
                 if up < 0:
                     up = 0 - up
@@ -626,7 +626,7 @@ def detect_rest(state):
                 if x <= wait and decided & _TURNED == 0:
                     decided |= _ADOPT
             if decided & _ADOPT:
-                # nothing is known of the bias any more; the heading may be off by what it seemed to turn
+                # nothing is known of the bias any more; the heading may be off by what it seemed to turn, up to 14 deg
                 open_bias(state)
                 x = int(root(s[_P])) + turn // 20480
                 if x > 22702:
@@ -643,7 +643,7 @@ def detect_rest(state):
         # upset: at rest, and the horizontal part of S is more than upset_g
         x = (s[_S] << k >> k) >> 16
         y = (s[_S + 1] << k >> k) >> 16
-        if s[_STILL] < n and jump > s[_JUMP] and s[_P + 5] > _TENTH_P:
+        if s[_STILL] < n and jump > s[_JUMP]:
             decided |= _JUMPED
             s[_AGAIN] = 1
         elif s[_N] > s[_SOON] and x * x + y * y > s[_UPSET]:
@@ -857,6 +857,8 @@ def judge_field(state):
     s[_LOST] = lost
     s[_OWN] = own
     back = s[_BACK]
+    if good:
+        back = 0
     if restart:
         near = s[_FIELD_AFTER]
         good = 1
@@ -869,8 +871,6 @@ def judge_field(state):
         if have & 2:
             if bits & _FORGET == 0:
                 need = (s[_FOR] << 1) + s[_NEED]
-                if need > s[_NEED_MOST]:
-                    need = s[_NEED_MOST]
                 if bits & _CONSISTENT and need > s[_FIELD_NEW]:
                     need = s[_FIELD_NEW]
             if bits & _NEAR_OLD:
@@ -929,14 +929,14 @@ def judge_field(state):
             s[_STILL_E] = (s[_STILL_E] << k >> k) + (x >> 15) * s[_STILL_K]
     n = 0
     if good or s[_HAVE] & 2 == 0:
-        n = 2
+        n = 1
     s[_WEIGHT] = n
 
 
 # ------------------------------------------------------------------------------------------ heading and bias
 @micropython.viper
 def grow(s: ptr32):
-    """P after a block: the heading turns away by -up . bias; heading and bias walk."""
+    """P after two blocks: the heading turns away by -up . bias; heading and bias walk."""
     k = 0
     if s[_PROBE] > 0:
         k = 32
@@ -1185,7 +1185,7 @@ def measure_bias(s: ptr32) -> int:
     s[_AXIS] = i
     if s[_STILL] == s[_REST_AFTER]:
         # gyro - b, counts, Q8
-        x = (s[_LOW2 + 3 + i] << k >> k) - ((s[_B + i] << k >> k) >> s[_B_SHIFT] - 12) >> 4
+        x = (s[_LOW2 + 3 + i] << k >> k) - ((s[_B + i] << k >> k) >> s[_B_SHIFT] - 12) + 8 >> 4
         most = 0x3FFFFFFF // s[_B_INVERSE]
         if x > most:
             x = most
@@ -1298,7 +1298,7 @@ def apply(s: ptr32):
         s[_O + n] = (s[_O_BASE + n] << k >> k) - y - (m >> b_shift)
         s[_OR + n] = (s[_OR_BASE + n] << k >> k) - ((m - (m >> b_shift << b_shift)) >> shift)
         n += 1
-    # the heading, no more than 1/2 rad a block
+    # the heading, no more than 1/2 rad in two blocks
     x = s[_DX] << k >> k
     if x > 0x1999999:
         x = 0x1999999

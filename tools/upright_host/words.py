@@ -122,6 +122,7 @@ REST_ACCEL   1  Q6   the same of the accelerometer
 REST_MOST    1  Q12  most that is taken for a bias, counts
 """
 
+# of the inertial filter; a block is a levelling, and what counts blocks in rest, P and field counts pairs of them
 INERTIAL = """
 TWO_MASK     1  -    steps of two blocks less 1
 LEVEL        1  -    log2 of the steps of a levelling: 0 at the start, BLOCK in the end
@@ -130,11 +131,11 @@ REGRESS      1  -    1: the regressors take their step next
 PART         1  -    part of the work of two blocks that comes next
 PACE         1  -    parts in one step
 GG           3  -    gyro counts summed over two blocks
-FULL         1  -    samples in a row with a gyro axis at full scale, no more than FULL_MOST
+FULL         1  -    samples in a row with a gyro axis at full scale, no more than 10
 CLIPS        1  -    samples with one, no more than 2**30 - 1
-CLIPPED      1  -    samples with one in this block
+CLIPPED      1  -    samples with one since P grew last
 CLIP         1  Q15  what one adds to the doubt of the heading, units of 2.5 rad
-OUTAGE       1  -    steps without one that restart the ramp
+OUTAGE       1  -    steps without a fresh sample after which the tilt starts again
 SEEN         3  Q12  the gyro of one sample, less BASE
 H            3  Q14  specific force of the block in the earth frame, counts
 RATE         1  -    squared turn rate of the block, (4 counts)**2
@@ -161,7 +162,7 @@ K_PACE       1  Q20  tilt gain of a block after the start
 K_START      1  Q20  tilt gain of a block while little is known of the bias ...
 K_LEAST      1  Q20  ... and its bounds afterwards
 K_MOST       1  Q20
-K_TURN       1  -    tilt gain for the fourth root of HELD: K_TURN / 2**18
+K_TURN       1  -    tilt gain for the fourth root of HELD: K_TURN / 2**22
 NORM         1  -    shift that brings 1 g to 2**14..2**15 counts
 G1           1  -    1 g in counts
 LI           1  Q29  1 / (1 g, normalised)
@@ -176,33 +177,32 @@ JUMP         1  Q12  a bias found at rest that restarts the ramp, counts
 SOON         1  -    steps after a restart in which no other follows
 WAIT         1  -    blocks for which a rest has contradicted the bias
 WAIT_MOST    1  -    blocks
-WAIT_FIELD   1  -    blocks that the magnetometer is waited for
 WAIT_SURE    1  -    blocks after which a slow turn is decided, too
 WAIT_E       1  Q28  the heading error at their start, rad
 WAIT_TURN    1  Q28  corrections of the heading since, rad
 WAIT_A       3  Q12  accelerometer at their start, counts
 WAIT_MOVED   1  -    how far it may be from there: counts**2 / 16
-GYRO         1  Q28  the angle of a count in one block, rad
+GYRO         1  Q28  the angle of a count in two blocks, rad
 B_SHIFT      1  -    B is in counts, Q(B_SHIFT)
 B_MAX        1  -    its bound
 B_UNIT       1  -    the unit of P's biases in B's, / 2**13
 B_INVERSE    1  -    2**20 counts / this unit
 P            16 Q30  covariance of heading (2.5 rad) and bias (bias_start * 2**0.5), 4 x 4
-DX           4  Q27  their correction in this block
+DX           4  Q27  their correction in these two blocks
 INNOVATION   1  Q27  what is measured of ROW . (heading, bias), less what DX says ...
 NOISE        1  Q20  ... its variance ...
 Z            4  Q30  ... P ROW ...
 TOTAL        1  Q30  ... and ROW P ROW
-P_REST       1  Q30  variance of a bias of 1 block of rest
+P_REST       1  Q30  variance of a bias after two blocks of rest
 P_KNOWN      1  Q30  variance of a bias that is known ...
 P_VAGUE      1  Q30  ... and of one of which little is known
 P_SET        1  Q30  variance of a bias that was set with known_s = 1
-Q_HEADING    1  Q30  variance that a block adds to the heading ...
+Q_HEADING    1  Q30  variance that two blocks add to the heading ...
 Q_SCALE      1  -    ... and for RATE: Q_SCALE / 2**Q_SCALE_SHIFT
 Q_SCALE_SHIFT 1 -
-Q_LEVEL      1  Q30  variance that a block adds to a horizontal bias ...
+Q_LEVEL      1  Q30  variance that two blocks add to a horizontal bias ...
 Q_UP         1  Q30  ... and to a vertical one
-GROW         1  Q20  heading that a unit of bias makes in a block
+GROW         1  Q20  heading that a unit of bias makes in two blocks
 R_TILT       1  Q20  variance of a tilt correction as a bias
 R_REST       1  Q20  variance of the gyro at rest
 R_MAG        1  Q20  variance of a heading
@@ -232,7 +232,7 @@ STEADY_MOST  1  -    blocks
 OWN          1  -    1: the heading error is the attitude's own, not another field's
 LOST         1  -    half blocks of such an error
 RESTART_AFTER 1 -    half blocks
-WEIGHT       1  -    2: the heading is taken up
+WEIGHT       1  -    1: the heading is taken up
 TOL          1  Q15  tolerance squared
 SAME         1  Q15  the same for a field that has not changed
 SMOOTH       1  Q10  blocks of 0.05 s
@@ -241,7 +241,6 @@ FIELD_AFTER  1  -    blocks
 FIELD_FIRST  1  -    blocks
 FIELD_NEW    1  -    blocks
 NEED         1  -    blocks of 5 s
-NEED_MOST    1  -    blocks
 TURNING_MIN  1  -    squared turn rate, (4 counts)**2
 GATE         1  Q28  heading error that is believed, beside the doubt, rad
 GOOD         1  -    1: the field is the reference's, and its heading is believed
