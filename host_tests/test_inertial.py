@@ -353,7 +353,7 @@ def disturb(rng, filter):
     put("LOW2", signed(3, 32767 << 12) + signed(3, 40960 << 12))
     word("BLOCKS", 0, 1, s[AT.BLOCKS])
     word("STILL", 0, s[AT.REST_AFTER] - 1, s[AT.REST_AFTER])
-    word("WAIT", 0, 0, s[AT.WAIT_MOST], s[AT.WAIT_SURE], s[AT.WAIT_FIELD])
+    word("WAIT", 0, 0, s[AT.WAIT_MOST], s[AT.WAIT_SURE])
     put("WAIT_A", some(signed(3, 32767 << 12), s[AT.LOW2 : AT.LOW2 + 3]))
     put("WAIT_TURN", signed(1, (1 << 29) - 1))
     # heading and bias
@@ -423,9 +423,7 @@ def stand_still(rng, filter, row):
     if rng.random() < 0.5:
         s[AT.S] = s[AT.S + 1] = 0
     s[AT.STILL] = rng.choice((0, s[AT.REST_AFTER] - 1, s[AT.REST_AFTER]))
-    s[AT.WAIT] = rng.choice(
-        (0, s[AT.REST_AFTER], s[AT.WAIT_MOST], s[AT.WAIT_SURE], s[AT.WAIT_FIELD])
-    )
+    s[AT.WAIT] = rng.choice((0, s[AT.REST_AFTER], s[AT.WAIT_MOST], s[AT.WAIT_SURE]))
     if rng.random() < 0.8:
         s[AT.WAIT_A : AT.WAIT_A + 3] = s[AT.LOW2 : AT.LOW2 + 3]
 

@@ -453,17 +453,19 @@ class InertialFloat(FieldFloat):
         turned = turned > (WAIT_MOVED_G * self.lsb) ** 2
         adopt = False
         if not turned and known and self.wait >= self._patience(min(known)):
-            if self._field_known() and self.decided & (NEAR_REFERENCE | NEAR_CANDIDATE):
+            near = self.decided & (NEAR_REFERENCE | NEAR_CANDIDATE)
+            told = (
+                up > math.radians(self.p["rest_dps"]) / 2
+            )  # a turn about the vertical is what the field can tell
+            if told and self._field_known() and near:
                 # what the gyro says the heading turned by; the magnetometer knows better
                 moved = abs(wrap(self.e - self.wait_e) + self.wait_turn)
                 sure = self.wait >= self.pairs(WAIT_SURE)
-                if moved < TURN_LEAST:
-                    turned = turn >= 2 * TURN_LEAST or (sure and moved < turn / 2)
-                adopt = not turned and (moved >= TURN_LEAST or sure)
+                turned = moved < TURN_LEAST and (turn >= 2 * TURN_LEAST or sure)
+                adopt = moved >= TURN_LEAST
             else:
-                adopt = not self._field_known() or self.wait >= max(
-                    1, self.pairs(self.p["rest_wait"])
-                )
+                waited = self.wait >= max(1, self.pairs(self.p["rest_wait"]))
+                adopt = bool(not self._field_known() or near or waited)
         turned = self.decide(TURNED, turned)
         if self.decide(ADOPT, adopt):
             self.open_bias()

@@ -531,6 +531,7 @@ def detect_rest(state):
     contradicts = False
     known = _HALF
     jump = 0
+    most = 0
     up = 0
     shift = s[_B_SHIFT] - 12
     i = 0
@@ -550,6 +551,8 @@ def detect_rest(state):
         if x > s[_REST_MOST]:
             still = False
         x = s[_P + 5 + 5 * i]
+        if y > most:
+            most = y
         if y > jump and x > _TENTH_P:
             jump = y
         if y > s[_REST_OFF] and x < s[_P_KNOWN]:
@@ -608,7 +611,7 @@ def detect_rest(state):
                 if turn > i:
                     turn = i
                 turn = turn * s[_GYRO] >> 4
-                if field and near:
+                if field and near and up > s[_REST_OFF] >> 1:
                     y = (s[_HEADING] << k >> k) - (s[_WAIT_E] << k >> k)
                     if y > _PI28:
                         y = y - _PI28 - _PI28
@@ -619,14 +622,15 @@ def detect_rest(state):
                         y = 0 - y
                     # 0.1 rad are four times the noise of two headings
                     if y < _TENTH:
-                        if turn >= _TENTH << 1 or (wait >= s[_WAIT_SURE] and y < turn >> 1):
+                        if turn >= _TENTH << 1 or wait >= s[_WAIT_SURE]:
                             decided |= _TURNED
-                        elif wait < s[_WAIT_SURE]:
+                        else:
                             x = 0x3FFFFFFF
                 if x <= wait and decided & _TURNED == 0:
                     decided |= _ADOPT
             if decided & _ADOPT:
                 # nothing is known of the bias any more; the heading may be off by what it seemed to turn, up to 14 deg
+                jump = most
                 open_bias(state)
                 x = int(root(s[_P])) + turn // 20480
                 if x > 22702:
