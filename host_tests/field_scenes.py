@@ -1,8 +1,8 @@
 """Scenes that every user meets, each with the figures that a filter has to reach in it: rest after a turn, a large
 bias, magnets, pushes, spins beyond the gyro's range, cones, slow loops.
 
-Needs numpy; a filter goes through them translated to C (translate.py). `measured` gives a scene's figures, LIMITS says
-the largest that each may be.
+Needs numpy; a filter goes through them translated to C (translate.py). `measured` gives the figures of a scene;
+its limits say the largest that each may be.
 """
 
 import math
@@ -311,7 +311,7 @@ _rest_after(
     5,
     125,
     bias=tuple(round(256 * 16.4 * b) for b in (1.2, -0.8, 4.6)),
-    known_s=1,
+    known_s=100,
 )
 for _name, _drift, _all in (
     ("parked, z drifted by 1", (0, 0, 0.1), False),
@@ -467,7 +467,7 @@ def _pushed_at_first():
     return motion
 
 
-for _rate, _limit in ((100, 0.6), (200, 0.2), (500, 0.25)):
+for _rate, _limit in ((100, 0.4), (200, 0.1), (500, 0.1)):
     SCENES[f"cone at {_rate} Hz"] = Scene(
         lambda r=_rate: cone(r),
         lambda run: {"yaw": run.yaw(2), "tilt": run.tilt(2)},

@@ -25,7 +25,18 @@ from upright import filters
 NAMES = [name for name in filters.FILTERS if name not in filters.HARDWARE]
 GYRO = [(131, 1), (131, 2), (164, 5), (82, 5)]
 ACCEL = [16384, 8192, 4096, 2048, 64, 32767, 5000]
-RATES = [(50, 1), (82, 1), (100, 1), (200, 1), (2000, 7), (333, 1), (500, 1), (1000, 1), (1439, 1)]
+RATES = [
+    (20, 1),
+    (46, 1),
+    (91, 1),
+    (100, 1),
+    (200, 1),
+    (2000, 7),
+    (333, 1),
+    (500, 1),
+    (1000, 1),
+    (1439, 1),
+]
 BIAS = 8192 * 256
 FULL = (-32768, 32767)
 # filters without a table of parameters: (least, most)

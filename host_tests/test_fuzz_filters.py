@@ -7,12 +7,11 @@ from upright import complementary
 
 pytestmark = pytest.mark.skipif(not translate.GCC, reason=translate.NO_GCC)
 
-CLASSIC = ("mahony6", "mahony9", "euler6", "kalman6")
-EACH = 2_500_000
+EACH = 1_500_000
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CLASSIC)
+@pytest.mark.parametrize("name", fuzz_filters.NAMES)
 def test_nothing_leaves_32_bits_in_millions_of_hostile_steps(name):
     steps, number = 0, 0
     while steps < EACH:
