@@ -450,8 +450,14 @@ def test_nothing_leaves_32_bits_at_the_corners_of_the_accepted_range(checked):
                     filter.update(counts)
                     assert abs(math.hypot(*filter.state[1:5]) / ONE - 1) < 1e-3
                 filter.state[AT.PACE] = pace
+    # not called here; and what only a P that was no covariance would reach (fuzz_filters found one)
+    spared = ("fixmath._euler", "fixmath.add_scaled")
+    bounds = (": 0 - most", ": 0 - _HALF", ": _HALF")
     missed = [
-        m for m in watch.missed() if not m.startswith(("fixmath._euler", "fixmath.add_scaled"))
+        m
+        for m in watch.missed()
+        if not m.startswith(spared)
+        and not (m.startswith("inertial_kernels.take") and m.endswith(bounds))
     ]
     assert missed == [], "\n".join(missed)
 

@@ -161,7 +161,7 @@ class FieldFloat(EarthFloat):
         n = min(n, self.pairs(FOR_MOST))
         if returns:
             n = max(n, self.old_seen)
-        if r is not None and (restart or not has & NEAR_REFERENCE):
+        if r is not None and not has & SAME and (restart or not has & NEAR_REFERENCE):
             self.old, self.old_seen, self.back = r, self.seen, 0
         self.reference, self.seen = list(self.candidate), n
         return "restart" if restart else True

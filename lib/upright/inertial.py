@@ -382,7 +382,9 @@ class Inertial9(EarthFilter):
             s[_P + i] = 0
         variance = _HALF
         if known_s > 0:  # 0.5 deg/s / known_s**0.5
-            variance = fixmath.ratio(s[_P_SET] * MILLION, fixmath.quantise(known_s, "known_s"))
+            variance = fixmath.ratio(
+                s[_P_SET] * MILLION, max(1, fixmath.quantise(known_s, "known_s"))
+            )
             variance = min(_HALF, max(64, variance))
         for i in range(1, 4):
             s[_DX + i] = 0  # it belongs to the old one

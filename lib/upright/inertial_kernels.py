@@ -191,7 +191,7 @@ _MOST = const(536870912)  # 4 units, Q27
 def root(n: int) -> int:
     """The integer part of the root of 0 <= n < 2**30."""
     bit = 16384
-    while bit * bit > n:
+    while bit and bit * bit > n:
         bit >>= 1
     r = 0
     while bit:
@@ -897,7 +897,7 @@ def judge_field(state):
                 n = s[_FOR_MOST]
             if returns and n < s[_FO_FOR]:
                 n = s[_FO_FOR]
-            if have & 2 and (restart or bits & _NEAR_REFERENCE == 0):
+            if have & 2 and bits & _SAME_BIT == 0 and (restart or bits & _NEAR_REFERENCE == 0):
                 s[_FO] = s[_FR]
                 s[_FO + 1] = s[_FR + 1]
                 s[_FO_FOR] = s[_FOR]
@@ -1119,13 +1119,19 @@ def take(s: ptr32):
         left = 0 - y
         y = 0
     half = 1 << y >> 1
+    most = _HALF >> left  # no variance changes by more
     i = 0
     at = _P
     while i < 4:
         m = s[_Z + i] << k >> k
-        x = (s[at] << k >> k) - (((m * m >> 15) * r + half >> y) << left)
+        x = (m * m >> 15) * r + half >> y
+        if x > most:
+            x = most
+        x = (s[at] << k >> k) - (x << left)
         if x < _LEAST:
             x = _LEAST
+        elif x > _HALF:
+            x = _HALF
         s[at] = x
         n = i + 1
         v = at
@@ -1133,7 +1139,16 @@ def take(s: ptr32):
         while n < 4:
             v += 1
             x += 4
-            e = (s[v] << k >> k) - (((m * (s[_Z + n] << k >> k) >> 15) * r + half >> y) << left)
+            e = (m * (s[_Z + n] << k >> k) >> 15) * r + half >> y
+            if e > most:
+                e = most
+            elif e < 0 - most:
+                e = 0 - most
+            e = (s[v] << k >> k) - (e << left)
+            if e > _HALF:
+                e = _HALF
+            elif e < 0 - _HALF:
+                e = 0 - _HALF
             s[v] = e
             s[x] = e
             n += 1
