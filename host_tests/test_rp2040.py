@@ -247,7 +247,7 @@ def test_a_float_in_the_tick_fails(landed):
     )
     before, after, later, error = said.split(None, 3)
     assert before == "0"
-    assert 9 <= int(after) <= 11
+    assert 9 <= int(after) <= 23  # ten ticks; a step that raised is made up for, and raises again
     assert later == "0"
     assert "MemoryError" in error
 
@@ -461,9 +461,9 @@ def until_interrupted():
             imu.angles()
     except KeyboardInterrupt:
         pass
-while True:
+while caught < 200:
     try:
-        while True:
+        while caught < 200:
             until_interrupted()
             caught += 1
     except KeyboardInterrupt:
@@ -472,8 +472,8 @@ while True:
 
 
 def test_three_hundred_ctrl_c_never_end_the_tick(image, version):
-    """They come at any time, also in the hard interrupt. Where one lands in the second handler it ends the
-    program, and the tick goes on beside the prompt."""
+    """They come at any time, also in the hard interrupt. The program ends after 200 of them, or where one lands in the
+    second handler; the tick goes on beside the prompt."""
     files = emulated.project(version)
     files["main.py"] = INTERRUPTED
     board = rp2040.Board(image, files)

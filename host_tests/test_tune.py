@@ -172,7 +172,10 @@ def test_the_scan_becomes_a_table_sentences_a_file_and_a_picture(run, tmp_path):
     ("arguments", "message"),
     [
         (("--axis", "yaw"), "unknown axis 'yaw'; there are roll, pitch"),
-        (("--source", "magic"), "unknown source 'magic'; there are accelerometer, mahony6"),
+        (
+            ("--source", "magic"),
+            "unknown source 'magic'; there are accelerometer, inertial6, inertial9, mahony6",
+        ),
         (("--seconds", 0.5), "no truth in it, or in this span"),
     ],
 )

@@ -377,8 +377,15 @@ def _exists(path):
 
 
 def _contents(path):
+    # piece by piece: a small heap may not have _SIZE_MAX in one
+    data = b""
     with open(path, "rb") as file:
-        return file.read(_SIZE_MAX + 1)
+        while len(data) <= _SIZE_MAX:
+            piece = file.read(256)
+            if not piece:
+                break
+            data += piece
+    return data
 
 
 def _interrupted(path):
