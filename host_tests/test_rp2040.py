@@ -464,14 +464,16 @@ def until_interrupted():
 while caught < 200:
     try:
         while caught < 200:
-            until_interrupted()
+            try:
+                until_interrupted()
+            except KeyboardInterrupt:
+                pass
             caught += 1
     except KeyboardInterrupt:
         pass
 """
 
 
-@pytest.mark.xfail(reason="the first may end the program: then none is left to be caught")
 def test_three_hundred_ctrl_c_never_end_the_tick(image, version):
     """They come at any time, also in the hard interrupt. The program ends after 200 of them, or where one lands in the
     second handler; the tick goes on beside the prompt."""
@@ -484,6 +486,7 @@ def test_three_hundred_ctrl_c_never_end_the_tick(image, version):
     board.boot()
     board.start(world)
     board.expect("started", 20)
+    board.run(0.1)  # it is in its loop
     for i in range(300):
         board.send(b"\x03")
         board.run(0.003 + 0.00013 * (i % 40))  # 5 ms is the tick's period
