@@ -104,11 +104,11 @@ def test_a_packed_installation_is_imported_as_any_other(tmp_path):
         files = contents.packed(contents.board_files("pyboard", facts))
         assert not [name for name in files if name.endswith(".mpy")]
         flash.execute(board, flash.plan(board, files))
-        board.exec("import upright\nfrom upright import fixmath, inertial\nimport upright.ssd1306")
+        board.exec("import upright\nfrom upright import fixmath, mahony\nimport upright.ssd1306")
         board.exec("from upright_app import pages")
         assert board.eval("fixmath.isqrt(49)") == 7
         assert board.eval("upright.__version__") == __version__
-        assert board.eval("inertial.__file__") == "/upright_z/upright/inertial.mpy"
+        assert board.eval("mahony.__file__") == "/upright_z/upright/mahony.mpy"
         assert board.eval("pages.__name__") == "upright_app.pages"
     finally:
         board.close()

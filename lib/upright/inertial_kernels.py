@@ -539,10 +539,10 @@ def detect_rest(state):
         x = s[_LOW2 + 3 + i] << k >> k
         y = x - ((s[_B + i] << k >> k) >> shift)
         n = y
-        if n > 0xFFFF00:
-            n = 0xFFFF00
-        elif n < 0 - 0xFFFF00:
-            n = 0 - 0xFFFF00
+        if n > 0xFF0000:
+            n = 0xFF0000
+        elif n < 0 - 0xFF0000:
+            n = 0 - 0xFF0000
         if y < 0:
             y = 0 - y
         up += (n >> 8) * (s[_R + 6 + i] << k >> k) >> 7  # of the gyro less B, Q12
