@@ -204,7 +204,7 @@ def test_a_sensor_that_is_gone_for_good_is_shown_on_the_display(boot, drive):
 def test_a_stuck_bus_costs_time_not_the_program(boot):
     result, *_ = boot(seconds=6, faults=[[3 * SECOND, "bus", "low", SECOND]])
     healthy(result)
-    assert result["errors"] > 100
+    assert result["errors"] > 50  # ticks after a time-out of a period are left out
     assert result["missed"] == 0  # a transfer is given up after 3 ms, and a tick tries one
     assert result["fresh"] > 700
 

@@ -1,15 +1,27 @@
 """What a board does before its I2C bus is made: free it, and compute its time-out."""
 
+import runpy
+
+import kernel
 import machine
 import pytest
+from chips.hmc5883l import HMC5883LChip
 from chips.mpu6050 import MPU6050Chip
-from upright import i2c_bus
+from upright import i2c_bus, settings
+from upright.ak8963 import AK8963
+from upright.auxiliary_bus import AuxiliaryBus
+from upright.hmc5883l import HMC5883L
+from upright.ist8310 import IST8310
 from upright.mpu6050 import MPU6050, MPU6050Error
+from upright.qmc5883l import QMC5883L
+from upright_host import paths
 from world import StillWorld
+
+import boards
 
 
 def pins():
-    return [machine.Pin(n, machine.Pin.OPEN_DRAIN, value=1) for n in (5, 4)]
+    return [machine.Pin(n) for n in (5, 4)]
 
 
 def sensor():
@@ -41,7 +53,44 @@ def test_a_bus_that_nobody_holds_gets_no_clocks_but_the_stop():
 
 @pytest.mark.parametrize("hz, port", [(100000, "rp2"), (400000, "rp2"), (400000, "esp32")])
 def test_the_longest_transfer_fits_into_the_time_out(hz, port):
-    batch = 8 * (14 + 8)
+    magnetometer = max(
+        kind.SAMPLE[1] + (kind.STATUS is not None) for kind in (AK8963, HMC5883L, IST8310, QMC5883L)
+    )
+    batch = settings.FIFO_BATCH * (14 + magnetometer)
     timeout = i2c_bus.timeout_us(hz, port)
     assert 9 * batch * 1000000 // hz < timeout < 9 * batch * 1000000 // hz + 20000
     assert port != "esp32" or timeout >= 20000
+
+
+@pytest.mark.parametrize("hz", [100000, 400000])
+def test_a_batch_of_nine_axes_comes_in_one_burst(hz):
+    """With a time-out that covers 120 bytes there was no packet at all."""
+    chip = MPU6050Chip(StillWorld())
+    chip.aux.append(HMC5883LChip(StillWorld()))
+    machine.wire_i2c(0, chip)
+    imu = MPU6050(machine.I2C(0, freq=hz, timeout=i2c_bus.timeout_us(hz)))
+    imu.configure(sample_rate_hz=100)
+    HMC5883L(AuxiliaryBus(imu)).configure(rate_hz=25)
+    imu.fifo_enable()
+    kernel.advance(110_000)
+    assert imu.fifo_poll() == 8
+    assert imu.errors == imu.fifo_overflows == 0
+
+
+def test_a_transfer_that_is_longer_than_its_time_out_fails():
+    machine.wire_i2c(0, MPU6050Chip(StillWorld()))
+    i2c = machine.I2C(0, freq=100000, timeout=2000)
+    assert i2c.readfrom_mem(0x68, 0x3B, 14)
+    with pytest.raises(OSError) as why:
+        i2c.readfrom_mem(0x68, 0x3B, 30)
+    assert why.value.args[0] == machine.ETIMEDOUT
+
+
+@pytest.mark.parametrize("name", boards.I2C)
+def test_each_board_frees_its_bus_before_it_makes_it(name):
+    bus, scl, sda, _ = boards.I2C[name]
+    machine.hold_sda(bus, scl, sda, 9)
+    board = runpy.run_path(paths.BOARDS / name / "board.py")
+    assert not machine._i2c_bus(bus).stuck
+    port = board.get("PLATFORM", "")
+    assert machine._i2c_bus(bus).timeout_us == i2c_bus.timeout_us(400000, port)

@@ -119,6 +119,52 @@ def test_a_tick_exactly_a_period_late_is_the_one_after_a_missed_one(tick, filter
     assert tick.missed == 1
 
 
+@pytest.mark.parametrize(
+    "timeout, every", [(2400, 1), (4000, 1), (5200, 3), (12000, 5), (39000, 16)]
+)
+def test_the_time_outs_of_a_stuck_bus_leave_half_of_the_time_to_the_main_program(
+    timeout, every, tick, filter, imu, monkeypatch
+):
+    """Where one takes most of a period or more, further steps are made at once, and their ticks do nothing."""
+    busy = 0
+
+    def read(self):
+        nonlocal busy
+        busy += timeout
+        kernel.advance(timeout)
+        self.counts[10] = 0
+        return 0
+
+    monkeypatch.setattr(Imu, "read", read)
+    for n in range(1, 101):
+        kernel.advance_to(max(n * PERIOD, kernel.now()))
+        tick.on_sample(None)
+    assert abs(len(filter.flags) - 100) <= every and tick.missed == 0
+    assert busy <= 100 * PERIOD * (0.5 if every > 1 else 0.8) + timeout
+    monkeypatch.undo()
+    ticks_at(tick, range(kernel.now() + PERIOD, kernel.now() + 20 * PERIOD, PERIOD))
+    assert filter.flags[-2:] == [1, 1] and tick.missed == 0
+
+
+def test_on_a_stuck_bus_the_magnetometer_is_not_asked_as_well(imu, filter):
+    class Mag:
+        reads = 0
+
+        def read(self, counts):
+            self.reads += 1
+
+    mag = Mag()
+    tick = Tick(imu, filter, PERIOD, mag=mag)
+    ticks_at(tick, [5000])
+    imu.flags = 0
+    ticks_at(tick, [10000])
+    assert mag.reads == 2
+    read = imu.read
+    imu.read = lambda: (kernel.advance(3700), read())
+    ticks_at(tick, [15000])
+    assert mag.reads == 2
+
+
 def test_what_was_made_up_for_before_a_stop_is_owed_no_more(tick, filter):
     ticks_at(tick, [5000, 10000, 25000])
     tick.resume()

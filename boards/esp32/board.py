@@ -2,18 +2,19 @@
 # lib/upright/settings.py lists every setting.
 
 from machine import I2C, Pin
-from upright import ssd1306, timing
+from upright import i2c_bus, ssd1306, timing
 from upright.mpu6050 import MPU6050
 
 NAME = "ESP32"
 PLATFORM = "esp32"  # sys.platform there
 
 _HZ = 400000
-# A stuck bus blocks a tick for this long at most (us). This port counts in ticks of 10 ms: below 20 ms every transfer
-# may fail (ESP-IDF 5.5.2 and newer).
-_TIMEOUT_US = 20000
+_scl, _sda = Pin(22), Pin(21)
 
-_i2c = I2C(0, scl=Pin(22), sda=Pin(21), freq=_HZ, timeout=_TIMEOUT_US)
+# a chip that a reset of the board has cut off in a read holds SDA low
+i2c_bus.free(_scl, _sda)
+# a stuck bus blocks a tick for the time-out
+_i2c = I2C(0, scl=_scl, sda=_sda, freq=_HZ, timeout=i2c_bus.timeout_us(_HZ, PLATFORM))
 
 
 def sensor():

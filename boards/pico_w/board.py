@@ -2,7 +2,7 @@
 # lib/upright/settings.py lists every setting.
 
 from machine import I2C, Pin
-from upright import ssd1306, timing
+from upright import i2c_bus, ssd1306, timing
 from upright.mpu6050 import MPU6050
 
 NAME = "Raspberry Pi Pico W"
@@ -10,10 +10,12 @@ PLATFORM = "rp2"  # sys.platform there
 SENSOR_RATE_HZ = 1000
 
 _HZ = 400000
-# A stuck bus blocks a tick for this long at most (us). The longest transfer, 120 bytes of the FIFO, has to fit in.
-_TIMEOUT_US = 1000 + 9 * 120 * 1000000 // _HZ
+_scl, _sda = Pin(5), Pin(4)
 
-_i2c = I2C(0, scl=Pin(5), sda=Pin(4), freq=_HZ, timeout=_TIMEOUT_US)
+# a chip that a reset of the board has cut off in a read holds SDA low
+i2c_bus.free(_scl, _sda)
+# a stuck bus blocks a tick for the time-out
+_i2c = I2C(0, scl=_scl, sda=_sda, freq=_HZ, timeout=i2c_bus.timeout_us(_HZ, PLATFORM))
 
 
 def sensor():

@@ -2,7 +2,7 @@
 # lib/upright/settings.py lists every setting.
 
 from machine import I2C, Pin
-from upright import ssd1306, timing
+from upright import i2c_bus, ssd1306, timing
 from upright.mpu6050 import MPU6050
 
 NAME = "Pyboard"
@@ -13,11 +13,12 @@ SENSOR_RATE_HZ = 1000
 FILTER = "mahony6"
 
 _HZ = 400000
-# A stuck bus blocks a tick for this long at most (us; this port rounds up to ms). The longest transfer, 120 bytes of
-# the FIFO, has to fit in.
-_TIMEOUT_US = 1000 + 9 * 120 * 1000000 // _HZ
+_scl, _sda = Pin("X9"), Pin("X10")
 
-_i2c = I2C(1, freq=_HZ, timeout=_TIMEOUT_US)  # X9, X10
+# a chip that a reset of the board has cut off in a read holds SDA low
+i2c_bus.free(_scl, _sda)
+# a stuck bus blocks a tick for the time-out
+_i2c = I2C(1, freq=_HZ, timeout=i2c_bus.timeout_us(_HZ, PLATFORM))  # on these pins
 
 
 def sensor():

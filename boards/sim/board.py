@@ -2,14 +2,20 @@
 # lib/upright/settings.py lists every setting.
 
 from machine import I2C, Pin
-from upright import ssd1306, timing
+from upright import i2c_bus, ssd1306, timing
 from upright.mpu6050 import MPU6050
 
 NAME = "simulated board"
 SENSOR_RATE_HZ = 1000
 DISPLAY_SHARES_BUS = True
 
-_i2c = I2C(0, scl=Pin(5), sda=Pin(4), freq=400000, timeout=3000)
+_HZ = 400000
+_scl, _sda = Pin(5), Pin(4)
+
+# a chip that a reset of the board has cut off in a read holds SDA low
+i2c_bus.free(_scl, _sda)
+# a stuck bus blocks a tick for the time-out
+_i2c = I2C(0, scl=_scl, sda=_sda, freq=_HZ, timeout=i2c_bus.timeout_us(_HZ))
 
 
 def sensor():

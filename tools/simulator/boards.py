@@ -6,7 +6,7 @@ from chips.mpu6050 import MPU6050Chip
 from chips.ssd1306 import SSD1306Chip
 
 # I2C boards: the bus of sensor and display, its pins SCL and SDA, and the pin of INT
-_I2C = {
+I2C = {
     "sim": (0, 5, 4, 6),
     "pico": (0, 5, 4, 6),
     "gy87_pico": (0, 5, 4, 6),
@@ -57,7 +57,7 @@ def _i2c_sensors(name, board, world, options):
 
 def _i2c_board(name, board, world, options):
     """MPU6050 and SSD1306 on one bus, or the display on the next."""
-    bus, scl, sda, interrupt = _I2C[name]
+    bus, scl, sda, interrupt = I2C[name]
     imu, mag = _i2c_sensors(name, board, world, options)
     if mag is not None and options.get("mag", True):
         imu.aux.append(mag)
@@ -96,7 +96,7 @@ def _robomaster_a(name, board, world, options):
 
 
 BOARDS = {"robomaster_a": _robomaster_a}
-BOARDS.update({name: _i2c_board for name in _I2C})
+BOARDS.update({name: _i2c_board for name in I2C})
 
 
 def wire(name, board, world, options):

@@ -202,8 +202,15 @@ class SoftI2C:
         if into is not None:
             if register is not None and not chip.i2c_start(True, clock.step(10)):
                 raise OSError(EIO)
+            end = clock.start + timeout
+            if port == "stm32":
+                end += 10000000  # it waits so long for each byte
             for i in range(len(into)):
-                into[i] = chip.i2c_read(clock.step(9))
+                at = clock.step(9)
+                if at > end:
+                    chip.i2c_stop(at)
+                    raise OSError(ETIMEDOUT)
+                into[i] = chip.i2c_read(at)
             bus.bytes += len(into)
         chip.i2c_stop(clock.step(1))
         clock.finish(0)
