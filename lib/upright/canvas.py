@@ -89,7 +89,7 @@ def _blit(fb, stride: int, height: int, cols, w: int, h: int, x: int, y: int, co
         o = at * stride + x + i
         while clear | flip:
             if at >= 0 and at << 3 < height:
-                p[o] = (p[o] & ~clear) ^ (flip & 255)
+                p[o] = (p[o] & (clear ^ 255)) ^ (flip & 255)
             clear >>= 8
             flip >>= 8
             at += 1

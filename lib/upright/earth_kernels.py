@@ -140,6 +140,7 @@ def compass(s: ptr32, at: int, half_turn: int):
     if s[_PROBE] > 0:
         k = 32
     n = s[at + 3]
+    first = at  # MicroPython 1.26 and 1.27 shift an index that is one of the first three variables (docs/numerics.md)
     j = s[_SINCE] + 1
     if j > 16:
         j = 16
@@ -149,10 +150,10 @@ def compass(s: ptr32, at: int, half_turn: int):
         return
     s[_J] = j
     s[_SINCE] = 0
-    x = (s[at] << k >> k) // n << 4
+    x = (s[first] << k >> k) // n << 4
     y = 0 - ((s[at + 1] << k >> k) // n << 4)
     s[_NOW + 1] = (s[at + 2] << k >> k) // n << 4
-    s[at] = 0
+    s[first] = 0
     s[at + 1] = 0
     s[at + 2] = 0
     s[at + 3] = 0

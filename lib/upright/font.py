@@ -110,8 +110,8 @@ def _smooth(at: int, out):
         b = 0
         if j >= 0 and j < 5:
             b = font[at + j]
-        upper = a | ((a << 1) & ~a & b & ~(b << 1))
-        lower = a | ((a >> 1) & ~a & b & ~(b >> 1))
+        upper = a | ((a << 1) & (a ^ -1) & b & ~(b << 1))
+        lower = a | ((a >> 1) & (a ^ -1) & b & ~(b >> 1))
         v = int(_spread(upper)) | int(_spread(lower)) << 1
         o[2 * k] = v & 255
         o[2 * k + 1] = v >> 8
