@@ -22,6 +22,8 @@ from upright_host.console import Wrong
 
 # of a trial on rp2040 when nobody asks for more: each takes ten or more of this machine's
 BOARD_SECONDS = 2
+# how the emulated board's magnetometer lies to its IMU: any map will do, and this one turns and mirrors
+MAG_AXES = ("y", "-x", "-z")
 
 
 @dataclass
@@ -39,9 +41,9 @@ def board_for(filter_name: str) -> str:
     return "robomaster_a" if registry.axes(filter_name) == 9 else "sim"
 
 
-def default_filter(trial: trials.Trial, runtime: str) -> str:
-    """The firmware's own default for what is in the trial; on rp2040 there is no magnetometer."""
-    return registry.default(trial.mag_uT_per_lsb is not None and runtime != "rp2040")
+def default_filter(trial: trials.Trial) -> str:
+    """The firmware's own default for what is in the trial."""
+    return registry.default(trial.mag_uT_per_lsb is not None)
 
 
 def replay(
@@ -60,16 +62,12 @@ def replay(
     on_progress  called with (rows done, rows in all) now and then
     Raises simulate.SimulationError, Unavailable, and Wrong for a filter, gains, or what a runtime cannot do.
     """
-    filter_name = filter_name or default_filter(trial, runtime)
+    filter_name = filter_name or default_filter(trial)
     scales = registry.Scales(trial.gyro_scale, trial.accel_lsb_per_g)
     registry.check(filter_name, gains, trial.rate, scales)
     if runtime == "rp2040":
         if direct:
             raise Wrong("on rp2040 the counts come through the chip's registers, not straight")
-        if board_for(filter_name) != "sim":
-            raise Wrong(
-                f"{filter_name} on rp2040: the emulated board is replayed without a magnetometer; take six axes"
-            )
         return _on_board(trial, filter_name, seconds, gains or {}, on_progress)
     with tempfile.TemporaryDirectory() as folder:
         world, out = Path(folder) / "trial.imu", Path(folder) / "attitudes"
@@ -107,6 +105,7 @@ def _on_board(trial, filter_name, seconds, gains, on_progress) -> Replay:
     """MicroPython's own firmware on an emulated RP2040; see tools/simulator/rp2040."""
     image, board = rp2040.image(), emulated.simulator()
     chips, worlds = library.simulator("chips.mpu6050"), library.simulator("world")
+    with_mag = board_for(filter_name) != "sim"
     if seconds is None and trial.seconds > BOARD_SECONDS:
         seconds = BOARD_SECONDS
         console.errors.print(
@@ -120,8 +119,12 @@ def _on_board(trial, filter_name, seconds, gains, on_progress) -> Replay:
         world = worlds.World(str(path))
         try:
             files = emulated.project(rp2040.version(image), application=False)
+            chip = chips.MPU6050Chip(world)
+            if with_mag:
+                mag = library.simulator("chips.ist8310").IST8310Chip(world, axes=MAG_AXES)
+                chip.aux.append(mag)
             q29, faults = board.replay(
-                image, files, chips.MPU6050Chip(world), filter_name, rows, gains, on_progress
+                image, files, chip, filter_name, rows, gains, on_progress, with_mag and MAG_AXES
             )
         except board.BoardError as why:
             raise simulate.SimulationError(f"on rp2040: {why}") from None
@@ -157,7 +160,7 @@ def register(app: typer.Typer) -> None:
     ):
         """Replay a trial through the simulated chip's registers, the driver, the tick and a filter; score it."""
         loaded = trials.load(trial)
-        filter = filter or default_filter(loaded, runtime)
+        filter = filter or default_filter(loaded)
         gains = {name: value for name, value in (("kp", kp), ("ki", ki)) if value is not None}
         with console.progress(f"{loaded.name} on {runtime}", loaded.rows(seconds)) as at:
             done = replay(loaded, filter, runtime, seconds, gains, direct, at)

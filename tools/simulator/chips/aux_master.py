@@ -123,6 +123,16 @@ class AuxMaster:
         self._chip._misused("auxiliary transactions do not fit into the sample period")
         self._waiting = (packet,)
 
+    def begin_anew(self):
+        """A recorded trial begins, and is the same whatever came before: slots with a delay run with its first row."""
+        if self._run is not None:
+            self._run.close()
+        self._run = self._talking = self._waiting = self.next_us = None
+        self._turn = 0
+        for slave in self.slaves:
+            if hasattr(slave, "begin_anew"):
+                slave.begin_anew()
+
     def skip(self, n):
         """n samples pass without a look at them."""
         self._turn += n

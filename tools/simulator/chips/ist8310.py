@@ -108,6 +108,12 @@ class IST8310Chip(Faults):
         if self._done_us is not None and self._now >= self._done_us:
             self._finish()
 
+    def begin_anew(self):
+        """A recorded trial begins: no measurement of the time before it is left, or under way."""
+        self._done_us = None
+        self._registers[_STAT1] = self._registers[_CNTL1] = 0
+        self._drive_pin()
+
     def next_event(self):
         """Absolute time in us of the next change of the DRDY pin by itself, or None."""
         return self._done_us if self._registers[_CNTL2] & _DREN else None

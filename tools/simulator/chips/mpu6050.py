@@ -221,6 +221,7 @@ class MPU6050Chip(Sensors):
             if self._driven():
                 self._settle_words()
                 self._done = 0
+                self.master.begin_anew()
                 self._next_us = self._time(1)
         running = self.awake and now >= self._reset_until and now >= self._dead_until
         if running:

@@ -87,7 +87,7 @@ class Steps:
 
 
 # As run_replay.py of tools/simulator does it
-_REPLAY = (
+_SENSOR = (
     TELL_PLACES
     + """
 import time
@@ -99,21 +99,43 @@ imu = board.sensor()
 imu.configure(accel_range_g=%(accel_range_g)d, gyro_range_dps=%(gyro_range_dps)d)
 imu.configure_interrupt()
 filter = filters.make(%(filter)r, %(rate)r, imu, %(gains)r)
-time.sleep_ms(2)
-imu.read()
-filter.seed(imu.counts)
-tick = tick.Tick(imu, filter, %(period_us)d, phase_gain_shift=tick.PHASE_GAIN_SHIFT_CHIP)
-tell_places(tick)
+calibrated, counts, wanted = None, imu.counts, 1
 """
 )
+_MAGNETOMETER = """
+from upright import calibration
+from upright.auxiliary_bus import AuxiliaryBus
+from upright.ist8310 import IST8310
+mag = IST8310(AuxiliaryBus(imu))
+mag.configure(rate_hz=160, sample_rate=%(rate)r)
+calibrated = calibration.Calibration(("x", "y", "z"), %(mag_axes)r, imu.accel_lsb_per_g, imu.gyro_scale)
+counts, wanted = calibrated.counts, 3
+"""
+_TICK = """
+for _ in range(40):
+    time.sleep_ms(1)
+    flags = imu.read()
+    if calibrated:
+        calibrated.apply(imu.counts)
+    if flags & wanted == wanted:
+        break
+filter.seed(counts)
+tick = tick.Tick(
+    imu, filter, %(period_us)d, phase_gain_shift=tick.PHASE_GAIN_SHIFT_CHIP, calibration=calibrated
+)
+tell_places(tick)
+"""
 _GYRO_RANGES = {(131, 1): 250, (131, 2): 500, (164, 5): 1000, (82, 5): 2000}
 
 
-def replay(image, files, chip, filter="mahony6", rows=None, gains=None, on_progress=None):
+def replay(
+    image, files, chip, filter="mahony6", rows=None, gains=None, on_progress=None, mag_axes=None
+):
     """Recorded samples through the chip's registers, the driver, and the tick in the data-ready line's hard interrupt.
 
-    files   the project on a board without main.py
-    chip    an IMU's model that answers on I2C; its world is a recorded trial (clocked), whose row k is chip sample k
+    files     the project on a board without main.py
+    chip      an IMU's model that answers on I2C; its world is a recorded trial (clocked), whose row k is chip sample k
+    mag_axes  MAG_AXES of the IST8310 on its auxiliary bus; None: there is none
     -> (quaternions Q29, one list of four a row; what went wrong, by name). The same numbers as run_replay.py's.
     """
     world = chip.world
@@ -132,8 +154,10 @@ def replay(image, files, chip, filter="mahony6", rows=None, gains=None, on_progr
         "rate": (num, den),
         "gains": gains or {},
         "period_us": (2000000 * den + num) // (2 * num),
+        "mag_axes": mag_axes,
     }
-    board.exec(_REPLAY % settings)
+    parts = (_SENSOR, _MAGNETOMETER, _TICK) if mag_axes else (_SENSOR, _TICK)
+    board.exec("".join(parts) % settings)
     steps.begin()
     board.start(world, 20_000)  # until then the interrupt has to be set
     board.exec("Pin(6, Pin.IN).irq(tick.on_sample, trigger=Pin.IRQ_RISING, hard=True)")
