@@ -19,6 +19,7 @@ from chips.mpu6500 import MPU6500Chip
 from chips.ssd1306 import SSD1306Chip
 from rich.console import Console
 from trial_files import as_trial
+from upright import filters
 from upright_host import bench as bench_command
 from upright_host import console, emulated, paths, replay, runtimes, scoring, tracing
 from upright_host import rp2040 as firmware
@@ -161,8 +162,6 @@ def test_the_counts_are_the_worlds_rows(landed):
 
 
 def test_the_quaternions_are_cpythons_bit_for_bit(landed):
-    from upright import filters
-
     class Scales:
         gyro_scale = landed.world.gyro_scale
         accel_lsb_per_g = landed.world.accel_lsb_per_g
@@ -309,24 +308,125 @@ def test_a_replay_on_the_board_writes_the_bytes_that_cpython_writes(image, tmp_p
     assert progress[-1] == (300, 300)
 
 
-@pytest.mark.parametrize("name", ["inertial6", "quaternion-kalman6"])
-def test_every_kind_of_filter_gives_cpython_s_bits_in_a_hard_interrupt(image, name):
+@pytest.mark.parametrize(("name", "rate"), [("inertial6", (200, 1)), ("inertial9", (2000, 7))])
+def test_the_default_filters_give_cpython_s_bits_in_a_hard_interrupt(image, name, rate):
+    """With nine axes the IST8310 is behind the IMU, through its auxiliary bus and its driver."""
     import motions
 
-    trial = as_trial(motions.render("bursts", rate=(200, 1), seconds=0.4, seed=3))
+    trial = as_trial(motions.render("bursts", rate=rate, seconds=0.4, seed=3))
     there, here = replay.replay(trial, name, "rp2040"), replay.replay(trial, name)
     assert np.array_equal(there.q29, here.q29)
     assert len(np.unique(there.q29, axis=0)) > 60
 
 
-@pytest.mark.parametrize(
-    ("options", "why"), [({"direct": True}, "registers"), ({"filter_name": "mahony9"}, "six axes")]
-)
-def test_what_the_board_does_not_replay_is_refused(options, why):
+def test_counts_cannot_go_straight_into_a_filter_of_the_board():
     import motions
 
-    with pytest.raises(ValueError, match=why):
-        replay.replay(as_trial(motions.render("static", seconds=1)), runtime="rp2040", **options)
+    with pytest.raises(ValueError, match="registers"):
+        replay.replay(as_trial(motions.render("static", seconds=1)), runtime="rp2040", direct=True)
+
+
+KERNELS = ("earth", "euler", "inertial", "mahony", "quaternion")
+
+
+def test_every_filter_has_cpython_s_bits_with_kernels_that_the_board_has_compiled_itself(
+    image, version, portable, tmp_path
+):
+    """As mip installs them. All filters in one boot, 200 samples each: attitudes, biases, every word of the state."""
+    import motions
+
+    names = [name for name in filters.FILTERS if name not in filters.HARDWARE]
+    world, out, options = (tmp_path / name for name in ("world.imu", "out", "options.json"))
+    motions.render("bursts", rate=(200, 1), seconds=1, seed=5).write(world)
+    options.write_text('{"mag_every": 3}')
+    files = emulated.project(version, application=False)
+    for kernel in KERNELS:
+        del files[f"lib/upright/{kernel}_kernels.mpy"]
+        source = paths.PACKAGE / f"{kernel}_kernels.py"
+        files[f"lib/upright/{source.name}"] = source.read_bytes()
+    cross = emulated.mpy_cross(version)
+    script = Path(__file__).parent / "portable" / "filter_history.py"
+    for path in (paths.SIMULATOR / "world.py", script):
+        files[f"{path.stem}.mpy"] = emulated.compile_module(path, cross)
+    files |= {path.name: path.read_bytes() for path in (world, options)}
+    board = rp2040.Board(image, files)
+    board.boot()
+    for kernel in KERNELS:  # first: while the heap is whole
+        board.exec(f"from upright import {kernel}_kernels", 60)
+    for name in names:
+        said = board.exec(
+            f"import sys\nsys.argv[:] = ['', 'world.imu', 'out', {name!r}, 'options.json']\n"
+            "sys.modules.pop('filter_history', None)\nimport filter_history\n"
+        )
+        assert said == portable("cpython", script.name, world, out, name, options), name
+        assert board.flash()["out"] == out.read_bytes(), name
+
+
+# ---------------------------------------------------------------- the other drives, as the Pico is shipped
+# machine.Timer of MicroPython before 1.26, which has no `hard`
+BEFORE_1_26 = """
+import machine
+
+class Before:
+    Pin = machine.Pin
+
+    class Timer:
+        PERIODIC = machine.Timer.PERIODIC
+
+        def __new__(cls, number, *, period, mode, callback, tick_hz):
+            return machine.Timer(number, period=period, mode=mode, callback=callback, tick_hz=tick_hz)
+
+timing.machine = Before
+"""
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ("DRIVE = 'fifo'", "machine.Timer, hard, every 5000 us, fifo drive"),
+        ("DRIVE = 'data_ready'", "data-ready pin, hard, every 5000 us, data_ready drive"),
+        (
+            BEFORE_1_26,
+            "machine.Timer, soft: ticks wait for the main program, every 5000 us, fifo drive",
+        ),
+    ],
+    ids=["fifo", "data_ready", "before 1.26"],
+)
+def test_no_sample_is_lost_with_another_drive(image, version, motion, settings, says):
+    """Display and sensor on one bus, the default filter, all other settings as they are shipped."""
+    board = rp2040.Board(
+        image, emulated.project(version, "pico", f"{settings}\nMEASURE_BIAS = False\n")
+    )
+    bus, board.world = board.i2c(0, sda=4, scl=5), World(motion[0])
+    imu, oled = bus.add(MPU6050Chip(board.world)), bus.add(SSD1306Chip())
+    board.data_ready(6, imu)
+    board.boot()
+    board.expect("drive", 10)
+    board.start(board.world)
+    board.run(0.8)
+    board.interrupt()
+    assert says in board.console, board.console
+    q, row = attitude(board)
+    steps, fresh = steps_and_fresh(board)
+    faults = board.eval(
+        "[application.imu.status()[name] for name in ('missed', 'crashes', 'errors', 'resets', 'display_errors')]"
+        " + [application.imu.sensor.fifo_overflows, application.imu.sensor.fifo_lost]"
+    )
+    assert fresh == steps
+    assert 0.8 * 200 - 10 <= steps <= 1.1 * 200
+    assert not any(faults), faults
+    assert bus.cuts == 0
+    assert imu.misuse == oled.errors == []
+    assert oled.lit
+    tilt = up(q) @ up(motion[1].q_true[row])
+    assert math.degrees(math.acos(min(1, tilt))) < 3
+    assert math.degrees(math.acos(up(q)[2])) > 3  # it does not lie level
+
+
+def up(q):
+    """The earth's z axis in the body."""
+    w, x, y, z = q / np.linalg.norm(q)
+    return np.array([2 * (x * z - w * y), 2 * (w * x + y * z), w * w - x * x - y * y + z * z])
 
 
 # ---------------------------------------------------------------- nine axes on SPI
