@@ -42,8 +42,10 @@ units, true roots and angles, and no rounding. Yes/no decisions are taken here, 
 # with z = P row' and S = row z + variance.
 # After two blocks b takes up the bias's part of x, `turn` about up the heading's; the tilt is never touched.
 #
-# A start, a restart of the tilt, or a gyro at full scale make P(heading) larger again, as far as 3 rad**2; what
-# contradicts the bias makes P(bias) that of the start.
+# A start, a restart of the tilt, or a gyro at full scale make P(heading) larger again, as far as 3 rad**2: this part of
+# the error has nothing to do with the biases, and what the rest has in common with them stays. Where P(heading) would
+# grow beyond, P(heading, bias) shrinks as a heading scaled to 3 rad**2 has it. What contradicts the bias makes P(bias)
+# that of the start.
 #
 # Field: the pair (horizontal, vertical) of the mean field, and e. It is believed while it is near the reference, and
 # |e| below field_gate + 1.125 doubt; at rest e stays where it was to 0.1 rad, too. Another field, or the same with
@@ -228,9 +230,7 @@ class InertialFloat(FieldFloat):
         variance = min(OPEN, variance)
         self.still_set = False
         if variance > self.P[0][0]:
-            self.P[0] = [variance, 0.0, 0.0, 0.0]
-            for i in range(1, 4):
-                self.P[i][0] = 0.0
+            self.P[0][0] = variance
             self.doubt = math.sqrt(variance)
 
     def open_bias(self):
@@ -514,9 +514,11 @@ class InertialFloat(FieldFloat):
             x = max(x, min(OPEN, (math.sqrt(P[0][0]) + missed) ** 2))
             self.clipped = 0
         if x > OPEN:
+            over = (x - OPEN) / 6.25  # in the integers' unit, (2.5 rad)**2; 1 / (2 OPEN) of it, and a little more
+            over = (int(over * 65536) + 1) / 65536 * 9 / 8
             x = OPEN
             for i in range(1, 4):
-                P[0][i] *= 15 / 16
+                P[0][i] *= 1 - over
                 P[i][0] = P[0][i]
         P[0][0] = x
         self.doubt = math.sqrt(x)

@@ -410,7 +410,7 @@ class Inertial9(EarthFilter):
         magnetometer takes it back. Six axes: since the start.
         """
         s = self.state
-        return 180000 if s[_P] >= _OPEN else (s[_DOUBT] >> 15) * 7162 >> 10
+        return 180000 if s[_P] >= _OPEN - (_OPEN >> 3) else (s[_DOUBT] >> 15) * 7162 >> 10
 
     @property
     def clipped(self):

@@ -204,18 +204,13 @@ def root(n: int) -> int:
 
 @micropython.viper
 def open_heading(state, variance: int):
-    """The heading's variance is at least this (Q30) from now on, and its error has nothing to do with the biases'."""
+    """The heading's variance is at least this (Q30) from now on; what was added has nothing to do with the biases."""
     s = ptr32(state)
     s[_STILL_SET] = 0
     if variance <= s[_P]:
         return
     s[_P] = variance
     s[_DOUBT] = int(root(variance)) * 20480
-    i = 1
-    while i < 4:
-        s[_P + i] = 0
-        s[_P + 4 * i] = 0
-        i += 1
 
 
 @micropython.viper
@@ -1018,11 +1013,15 @@ def grow(s: ptr32):
         if y * y > x:
             x = y * y
     if x > _OPEN:
+        # the error counts for less, and so does what it has in common with the biases: by 1 - (x - OPEN) / (2 OPEN)
+        y = (x - _OPEN >> 14) + 1
+        y += y >> 3
         x = _OPEN
         i = 1
         while i < 4:
             m = s[_P + i] << k >> k
-            m -= m >> 4
+            n = m >> 15
+            m -= n * y + ((m - (n << 15)) * y >> 15) >> 1
             s[_P + i] = m
             s[_P + 4 * i] = m
             i += 1
