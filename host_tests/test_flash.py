@@ -633,7 +633,7 @@ def test_with_upright_in_the_firmware_only_main_and_board_are_installed(board):
 
 
 @pytest.mark.parametrize("board_py, has, lacks", [
-    ("", {"inertial", "inertial_kernels"}, {"mahony", "ist8310", "dmp", "kalman", "mpu_selftest"}),
+    ("", {"inertial", "inertial_tilt", "inertial_kalman"}, {"mahony", "ist8310", "dmp", "kalman", "mpu_selftest"}),
     ('FILTER = "kalman6"', {"kalman", "euler_kernels", "fixmath"}, {"inertial", "dmp"}),
     ('FILTER = "dmp6"\nfrom upright import mpu6500', {"dmp", "dmp_image", "mpu6500"}, {"mahony"}),
     ("FILTER = None\ndef f():\n    from upright import ist8310", {"inertial", "ist8310", "magnetometer"}, {"mahony"}),

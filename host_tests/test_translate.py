@@ -96,7 +96,7 @@ def test_a_filter_goes_on_where_it_was_and_its_own_readings_see_it():
 
 def test_all_that_update_calls_is_translated():
     functions = translate.program(filters._class("inertial9").update).functions
-    assert {"inertial.update", "fixmath.turn", "inertial_kernels.take"} <= set(functions)
+    assert {"inertial.update", "fixmath.turn", "inertial_kalman.take"} <= set(functions)
 
 
 def found(run, *first):

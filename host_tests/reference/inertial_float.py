@@ -514,7 +514,9 @@ class InertialFloat(FieldFloat):
             x = max(x, min(OPEN, (math.sqrt(P[0][0]) + missed) ** 2))
             self.clipped = 0
         if x > OPEN:
-            over = (x - OPEN) / 6.25  # in the integers' unit, (2.5 rad)**2; 1 / (2 OPEN) of it, and a little more
+            over = (
+                x - OPEN
+            ) / 6.25  # in the integers' unit, (2.5 rad)**2; 1 / (2 OPEN) of it, and a little more
             over = (int(over * 65536) + 1) / 65536 * 9 / 8
             x = OPEN
             for i in range(1, 4):

@@ -1,5 +1,6 @@
 # The inertial-frame Mahony filter in 32-bit integers: sensor counts in, quaternion out. It estimates the gyro bias and
-# judges the magnetic field. Needs fixmath.py, earth_kernels.py, inertial_kernels.py and the viper emitter.
+# judges the magnetic field. Needs fixmath.py, earth_kernels.py, inertial_field.py, inertial_kalman.py,
+# inertial_tilt.py and the viper emitter.
 # update() is made for a hard interrupt: it allocates nothing, raises nothing, uses no float, and gives the same bits on
 # every port.
 
@@ -16,21 +17,9 @@ from upright.earth_kernels import (
     to_earth,
 )
 from upright.fixmath import turn
-from upright.inertial_kernels import (
-    apply,
-    close,
-    detect_rest,
-    grow,
-    judge_field,
-    level,
-    measure_bias,
-    measure_heading,
-    pace,
-    regress,
-    smooth_field,
-    start_again,
-    take,
-)
+from upright.inertial_field import judge_field, smooth_field
+from upright.inertial_kalman import apply, grow, measure_bias, measure_heading, take
+from upright.inertial_tilt import close, detect_rest, level, pace, regress, start_again
 
 # -- words of the state: written by tools/upright_host/words.py
 _PROBE = const(0)

@@ -26,7 +26,7 @@ BOXES = {
     "calibration": (640, 385, ["upright/calibration", "upright/trim"]),
     "display": (640, 255, ["upright/ssd1306", "upright/canvas", "upright/font"]),
     "filters": (20, 385, ["upright/filters", "upright/attitude", "upright/fixmath", "upright/*kernels",
-                          "upright/inertial", "upright/mahony", "upright/complementary", "upright/*kalman"]),
+                          "upright/inertial*", "upright/mahony", "upright/complementary", "upright/*kalman"]),
     "sensors": (330, 500, ["upright/mpu*", "upright/dmp*"]),
     "magnetometers": (640, 500, ["upright/auxiliary_bus", "upright/magnetometer*", "upright/ist8310", "upright/ak8963",
                                  "upright/hmc5883l", "upright/qmc5883l"]),

@@ -32,11 +32,12 @@ ARCHITECTURES = {
 MOVED = {
     **{name: f"upright.{name}" for name in (
         "attitude", "auxiliary_bus", "calibration", "complementary", "euler_kernels", "filters", "fixmath",
-        "inertial_kernels", "ist8310", "kalman", "mahony", "mpu6050", "mpu6500", "mpu_parts",
+        "ist8310", "kalman", "mahony", "mpu6050", "mpu6500", "mpu_parts",
         "mpu_selftest", "quaternion_kalman", "quaternion_kernels", "ssd1306", "tick", "timing",
     )},
     **{name: f"upright_app.{name}" for name in ("app", "axis_check", "bias", "doctor", "pages", "record")},
     "config": "upright.settings",
+    "inertial_kernels": "upright.inertial_tilt",
     "inertial_mahony": "upright.inertial",
     "mpu_common": "upright.mpu_monitor",
     "mpu_setup": "upright.mpu",
