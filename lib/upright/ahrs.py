@@ -370,6 +370,8 @@ class AHRS:
         rate = settings.RATE if settings.EXTERNAL_CLOCK else sensor.sample_rate
         if self._own_mag is not None:  # it is read by each step, with the FIFO by each tick
             rate = (settings.FIFO_HZ, 1) if self.drive == "fifo" else self.rate
+            self._mag_us = 1000000 * rate[1] // rate[0]
+            self._mag_due = time.ticks_us()
         elif self.drive == "timer" and rate != settings.RATE:
             raise ValueError(
                 "each magnetometer sample comes with one of the IMU's, so all of these must be read: "
@@ -409,7 +411,10 @@ class AHRS:
         """Read a sample while the tick is stopped. Returns its flags."""
         flags = self.sensor.read()
         if self._own_mag is not None:
-            flags = self._own_mag.read(self.sensor.counts)
+            now = time.ticks_us()
+            if time.ticks_diff(now, self._mag_due) >= 0:  # it counts on the rate of the steps
+                self._mag_due = time.ticks_add(now, self._mag_us)
+                flags = self._own_mag.read(self.sensor.counts)
         if not self.calibration.identity:
             self.calibration.apply(self.sensor.counts)
         return flags

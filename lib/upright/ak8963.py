@@ -21,7 +21,7 @@ _FUSE_ROM = const(0x0F)
 _BIT_16 = const(0x10)  # 0.15 uT per LSB; without it 0.6
 _SRST = const(0x01)  # CNTL2: soft reset, clears itself
 _SELF = const(0x40)  # ASTC: the field of the self-test
-_HOFL = const(0x08)  # ST2: |x| + |y| + |z| is 4912 uT or more (DS 6.4.3.6)
+_HOFL = const(0x08)  # ST2: |x| + |y| + |z| is 4912 uT or more (DS, Magnetic Sensor Overflow)
 
 
 class AK8963Error(OSError):
@@ -46,7 +46,7 @@ class AK8963(Magnetometer):
     chip = "AK8963"
     error_class = AK8963Error
     IDENTITY = (_WIA, b"\x48")
-    AVERAGES = {1: 9000}  # DS 5.3.2: 7.2 ms, at most 9
+    AVERAGES = {1: 9000}  # DS, Analog Circuit Characteristics: 7.2 ms, at most 9
     SAMPLE = (_ST1, 8)
     LAYOUT = (1, 2, 3, 4, 5, 6)
     NEVER = 0xFC
@@ -60,7 +60,7 @@ class AK8963(Magnetometer):
         if bits not in (14, 16):
             raise ValueError(f"bits {bits!r} is not 14 or 16")
         self._width = _BIT_16 if bits == 16 else 0
-        self.lsb_per_uT = (20, 3) if bits == 16 else (5, 3)  # DS 5.3.2
+        self.lsb_per_uT = (20, 3) if bits == 16 else (5, 3)  # DS table 8.3
         self.START = (_CNTL1, _SINGLE | self._width)
         self.adjusted = False
         Magnetometer.__init__(self, bus, address)
@@ -69,10 +69,10 @@ class AK8963(Magnetometer):
         return ((_ASTC, 0, _SELF),)
 
     def adjust(self):
-        """Read the fuse ROM: H * ((ASA - 128) / 256 + 1) is the field (DS 8.3.11)."""
+        """Read the fuse ROM: H * ((ASA - 128) / 256 + 1) is the field (DS, ASAX to ASAZ)."""
         registers = self._registers
         registers.write_register(_CNTL1, _POWER_DOWN)
-        time.sleep_ms(1)  # DS 6.3: 100 us before another mode
+        time.sleep_ms(1)  # DS, Operation Modes: 100 us before another mode
         registers.write_register(_CNTL1, _FUSE_ROM)
         found = [registers.read_register(_ASAX + i) for i in range(3)]
         registers.write_register(_CNTL1, _POWER_DOWN)

@@ -25,8 +25,8 @@ _BIT = const(0x10)  # CNTL1, mirrored in ST2 as BITM
 _POWER_DOWN = const(0x00)
 _SINGLE = const(0x01)
 _FUSE_ROM = const(0x0F)
-_PERIOD_US = {0x02: 125_000, 0x06: 10_000}  # continuous measurement 1 and 2, DS 6.3
-_MODE_US = const(100)  # in power-down before another mode, DS 6.3
+_PERIOD_US = {0x02: 125_000, 0x06: 10_000}  # continuous measurement 1 and 2, DS 6.4.3
+_MODE_US = const(100)  # in power-down before another mode, DS, Operation Modes
 
 
 class AK8963Chip(Compass):
@@ -51,7 +51,7 @@ class AK8963Chip(Compass):
         self._down_since = self._now - _MODE_US
 
     def _took(self):
-        return self.measure_us or 7200  # DS 5.3.2: typical; 9000 at most
+        return self.measure_us or 7200  # DS, Analog Circuit Characteristics: typical; 9000 at most
 
     def _finish(self, at):
         r = self._registers
@@ -59,7 +59,7 @@ class AK8963Chip(Compass):
         if mode in _PERIOD_US:
             self._done_us = at + _PERIOD_US[mode]
         if self._protected:
-            # DS 6.4.3.5: from the first byte of data that is read until ST2 is, the data are not replaced
+            # DS 6.4.3: from the first byte of data that is read until ST2 is, the data are not replaced
             r[_ST1] |= _DOR
             return
         sixteen = r[_CNTL1] & _BIT
@@ -70,7 +70,7 @@ class AK8963Chip(Compass):
             total += abs(value)
             value = (2 * value * 256 + self.asa[axis] + 128) // (2 * (self.asa[axis] + 128))
             self._put(_HXL + 2 * axis, clipped(value, limit), False)
-        # DS 6.4.3.6: |x| + |y| + |z| >= 4912 uT
+        # DS, Magnetic Sensor Overflow: |x| + |y| + |z| >= 4912 uT
         r[_ST2] = sixteen | (_HOFL if total * per >= 4912 * lsb else 0)
         if mode in _PERIOD_US and r[_ST1] & _DRDY:
             r[_ST1] |= _DOR
@@ -87,7 +87,7 @@ class AK8963Chip(Compass):
             r[_ST1] = 0
             self._protected = register != _ST2 and r[_CNTL1] & 0x0F in _PERIOD_US
         elif _ASAX <= register <= _ASAZ:
-            # DS 8.3.11: to be read in fuse ROM mode
+            # DS, ASAX to ASAZ: to be read in fuse ROM mode
             value = self.asa[register - _ASAX] if r[_CNTL1] & 0x0F == _FUSE_ROM else 0
         return value
 

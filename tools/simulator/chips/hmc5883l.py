@@ -60,7 +60,7 @@ class HMC5883LChip(Compass):
         else:
             r[_MODE] = r[_MODE] & 0x80 | _IDLE
         gain = self._gain
-        self._gain = r[_CRB] >> 5  # DS 6.3: a new gain counts from the second measurement on
+        self._gain = r[_CRB] >> 5  # DS table 8: a new gain counts from the second measurement on
         if self._unread:
             return  # DS table 17, LOCK
         for axis, value in enumerate(self._field(at - 3000, _LSB_PER_GA[gain], 100)):
