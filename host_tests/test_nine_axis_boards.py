@@ -38,7 +38,9 @@ def test_it_finds_its_magnetometer_and_north(module):
     assert (result["filter"], result["axes"]) == ("inertial9", 9)
     assert result["crashes"] == result["errors"] == result["cuts"] == result["resets"] == 0
     assert result["mag_errors"] == result["mag_resets"] == 0
-    assert result["mag_stale"] == 0  # at the start it is polled, faster than its rate was planned for
+    assert (
+        result["mag_stale"] == 0
+    )  # at the start it is polled, faster than its rate was planned for
     assert result["mag_fresh"] >= result["steps"] // 2 - 5
     assert run.score.total < 2.5
 

@@ -126,19 +126,24 @@ class Settings:
         chunk = self.DISPLAY_CHUNK
         good = is_int(chunk, 8, 128) and chunk % 8 == 0
         self._demand(wrong, "DISPLAY_CHUNK", good, "a multiple of 8, 8..128")
-        self._demand(wrong, "PAGE_SECONDS", _is_number(self.PAGE_SECONDS, 0), "seconds, 0 or more")
+        good = _is_number(self.PAGE_SECONDS, 0, 3600)
+        self._demand(wrong, "PAGE_SECONDS", good, "seconds, 0..3600")
         # rp2 allows 8388 ms at most (MicroPython's docs, machine.WDT)
-        good = self.WATCHDOG_MS == 0 or is_int(self.WATCHDOG_MS, 1000, 8000)
+        good = is_int(self.WATCHDOG_MS, 0, 0) or is_int(self.WATCHDOG_MS, 1000, 8000)
         self._demand(wrong, "WATCHDOG_MS", good, "ms as an int, 1000..8000, or 0")
         self._demand(wrong, "DECLINATION", _is_number(self.DECLINATION, -180, 180), "degrees")
-        good = self.CALIBRATION is None or isinstance(self.CALIBRATION, str)
+        good = self.CALIBRATION is None or _is_file_name(self.CALIBRATION)
         self._demand(wrong, "CALIBRATION", good, "the name of a file, or None")
         image = self.DMP_IMAGE
-        good = isinstance(image, (str, bytes, bytearray)) or hasattr(image, "seek")
+        good = isinstance(image, (bytes, bytearray)) or hasattr(image, "seek")
+        good = good or _is_file_name(image)
         self._demand(wrong, "DMP_IMAGE", good, "the name of a file")
         digest = self.DMP_SHA256
         good = digest is None or (isinstance(digest, str) and len(digest) == 64)
-        self._demand(wrong, "DMP_SHA256", good, "64 hexadecimal digits, or None")
+        good = good and not (digest or "").strip("0123456789abcdef")
+        self._demand(
+            wrong, "DMP_SHA256", good, "64 hexadecimal digits as sha256sum shows them, or None"
+        )
         self._demand(wrong, "GAINS", isinstance(self.GAINS, dict), "a dict")
         for name in ("EXTERNAL_CLOCK", "MEASURE_BIAS", "KEEP_BIAS", "DISPLAY_SHARES_BUS"):
             value = getattr(self, name)
@@ -203,7 +208,9 @@ def _is_pair(value):
     return pair and is_int(value[0], 1) and is_int(value[1], 1)
 
 
-def _is_number(value, low, high=None):
-    if not isinstance(value, (int, float)):
-        return False
-    return value >= low and (high is None or value <= high)
+def _is_number(value, low, high):
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and low <= value <= high
+
+
+def _is_file_name(value):
+    return isinstance(value, str) and value != "" and "\0" not in value
