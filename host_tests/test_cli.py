@@ -162,6 +162,7 @@ WRONG = {
     "calibrate mag CUT": "CUT",
     "calibrate mag CSV": "no magnetometer sample",
     "calibrate gyro CSV": "give --rate",
+    "calibrate gyro LARGE": "LARGE is larger than 64 MB: cut it into pieces",
     "calibrate gyro CSV --rate 200 --out NONE/a.json": "there is no folder",
     "calibrate show NONE": "missing",
     "doctor --simulated foo": "unknown board 'foo'; there are esp32",
@@ -201,9 +202,12 @@ def test_what_is_wrong_is_one_line_without_a_traceback_and_exit_code_2(
 ):
     cut = tmp_path / "cut.npz"
     cut.write_bytes(trial.read_bytes()[:2000])
+    large = tmp_path / "large.csv"
+    with open(large, "wb") as file:
+        file.truncate(100_000_000)
     stand_for = {
         **{"TRIAL": trial, "CUT": cut, "CSV": recorded_csv, "TEXT": recorded_csv},
-        **{"DIR": tmp_path, "NONE": tmp_path / "none"},
+        **{"LARGE": large, "DIR": tmp_path, "NONE": tmp_path / "none"},
     }
     words = line.split()
     for word, file in stand_for.items():
@@ -211,7 +215,8 @@ def test_what_is_wrong_is_one_line_without_a_traceback_and_exit_code_2(
     done = upright(*words)
     assert isinstance(done.exception, SystemExit), done.exception
     assert done.exit_code == 2, done.output
-    assert WRONG[line].replace("CUT", str(cut)).replace("TEXT", str(recorded_csv)) in done.stderr
+    said = WRONG[line].replace("CUT", str(cut)).replace("TEXT", str(recorded_csv))
+    assert said.replace("LARGE", str(large)) in done.stderr
     assert "Traceback" not in done.output and "Usage" not in done.output
     assert len(done.stderr.splitlines()) <= 3  # what was left out has a line each
 

@@ -3,6 +3,8 @@
 import csv
 import fractions
 import json
+import os
+from array import array
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +13,7 @@ import numpy as np
 from upright_host import library, trials
 from upright_host.console import Wrong
 
+_MOST_CSV = 64 << 20  # bytes: an hour at 1 kHz in few columns
 COLUMNS = ("ax", "ay", "az", "gx", "gy", "gz", "mx", "my", "mz", "temp", "flags")
 
 
@@ -136,26 +139,40 @@ def _from_csv(path: Path, rate, accel_range, gyro_range) -> Recording:
             f"{', '.join(map(str, sorted(lsb)))} g and {', '.join(map(str, sorted(scale)))} deg/s"
         )
     with open(path, encoding="utf-8-sig", newline="") as file:
+        if os.fstat(file.fileno()).st_size > _MOST_CSV:
+            raise Wrong(f"{path} is larger than {_MOST_CSV >> 20} MB: cut it into pieces")
         try:
-            head, *rows = csv.reader(file)
-        except (ValueError, UnicodeDecodeError, csv.Error) as why:
+            counts, times = _rows(csv.reader(file))
+        except (UnicodeDecodeError, csv.Error) as why:
             raise Wrong(f"{path}: not a CSV file with a header line: {why}") from why
-    names = [name.strip().lower() for name in head]
-    if not set(names) & set(COLUMNS):
-        raise Wrong(f"{path}: the first line names none of the columns {' '.join(COLUMNS)}")
-    counts = np.zeros((len(rows), 11), np.int64)
-    times = []
-    for i, row in enumerate(rows):
-        try:
-            for name, text in zip(names, row, strict=True):
-                if name in COLUMNS:
-                    counts[i, COLUMNS.index(name)] = int(text)
-                elif name == "t":
-                    times.append(float(text))
-        except (ValueError, OverflowError) as why:
-            raise Wrong(f"{path}, line {i + 2}: {why}; expected whole counts") from why
-    if not len(rows) or np.abs(counts).max() > 32768:
-        raise Wrong(f"{path}: no rows, or counts beyond 16 bits")
+        except ValueError as why:
+            raise Wrong(f"{path}{why}") from why
     if rate is None and len(times) > 1 and times[-1] > times[0]:
         rate = (len(times) - 1) / (times[-1] - times[0])
     return Recording(path.name, counts, rate, lsb[accel_range], scale[gyro_range])
+
+
+def _rows(lines) -> tuple[np.ndarray, list]:
+    """(counts, times) of a CSV's lines. Raises ValueError with what stands behind the file's name."""
+    head = next(lines, None)
+    if head is None:
+        raise csv.Error("it is empty")
+    names = [name.strip().lower() for name in head]
+    if not set(names) & set(COLUMNS):
+        raise ValueError(f": the first line names none of the columns {' '.join(COLUMNS)}")
+    places = [COLUMNS.index(name) if name in COLUMNS else None for name in names]
+    counts, times = array("h"), []  # millions of rows: as small as they can be
+    row = [0] * len(COLUMNS)
+    for i, fields in enumerate(lines):
+        try:
+            for name, place, text in zip(names, places, fields, strict=True):
+                if place is not None:
+                    row[place] = int(text)
+                elif name == "t":
+                    times.append(float(text))
+            counts.extend(row)
+        except (ValueError, OverflowError) as why:
+            raise ValueError(f", line {i + 2}: {why}; expected whole counts of 16 bits") from why
+    if not counts:
+        raise ValueError(": no rows")
+    return np.array(counts, np.int64).reshape(-1, len(COLUMNS)), times
