@@ -1,6 +1,10 @@
 """The commands that people type: what they show, what they write, and what they say when it cannot be done."""
 
+import os
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +12,8 @@ import typer
 from PIL import Image
 from trial_files import save
 from upright_host import console, replay, runtimes, scoring, simulate
+
+UPRIGHT = Path(sys.executable).with_name("upright")
 
 
 @pytest.fixture(scope="module")
@@ -191,6 +197,13 @@ WRONG = {
     "exec --runtime z80 CSV": "unknown runtime 'z80'",
     "exec --board abacus CSV": "unknown board 'abacus'",
     "dmp check NONE": "No such file",
+    "dmp check /dev/zero": "/dev/zero has more than 1048576 bytes",
+    "runtimes cpython --image /dev/zero": "/dev/zero has more than 16777216 bytes",
+    "exec CUT": "CUT is no program: 'utf-8' codec can't decode",
+    "exec /dev/zero": "/dev/zero has more than 1048576 bytes",
+    "faults --file /dev/zero": "/dev/zero has more than 1048576 bytes",
+    "faults --file NONE": "No such file",
+    "faults --file DEEP": "too deep",
     "runtimes --image NONE": "No such file",
     "bench --save NONE/a.md": "there is no folder",
 }
@@ -205,7 +218,10 @@ def test_what_is_wrong_is_one_line_without_a_traceback_and_exit_code_2(
     large = tmp_path / "large.csv"
     with open(large, "wb") as file:
         file.truncate(100_000_000)
+    deep = tmp_path / "deep.json"
+    deep.write_text("[" * 100_000)
     stand_for = {
+        "DEEP": deep,
         **{"TRIAL": trial, "CUT": cut, "CSV": recorded_csv, "TEXT": recorded_csv},
         **{"LARGE": large, "DIR": tmp_path, "NONE": tmp_path / "none"},
     }
@@ -233,7 +249,7 @@ def test_what_is_not_here_is_exit_code_3(upright, trial, monkeypatch):
         ("replay", trial, "--runtime", "unix32"),
         ("score", trial, "--runtime", "arm"),
         ("compare", trial, "--no-costs", "--runtime", "arm"),
-        ("exec", "--runtime", "unix", trial),
+        ("exec", "--runtime", "unix", __file__),
         ("tune", "kalman", trial, "--source", "mahony6", "--runtime", "unix"),
     ):
         done = upright(*words)
@@ -270,3 +286,63 @@ def test_what_a_damaged_file_brings_into_a_message_neither_fills_nor_upsets_the_
     said = capsys.readouterr().err.rstrip("\n")
     assert len(said) < 700 and said.startswith("a: xxx") and said.endswith("yyy")
     assert said.isprintable()
+
+
+COMMANDS = (
+    "--help",
+    "demo --headless --seconds 2 --runtime cpython",
+    "runtimes cpython",
+    "faults --list",
+)
+
+
+@pytest.mark.parametrize("line", COMMANDS)
+@pytest.mark.parametrize("closed", [">&-", ">&- 2>&-", "<&-", "<&- >&- 2>&-"])
+def test_a_command_runs_without_the_streams_that_nobody_has_opened(line, closed):
+    done = subprocess.run(
+        ["sh", "-c", f"{UPRIGHT} {line} {closed}"], capture_output=True, text=True, timeout=60
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("line", COMMANDS)
+def test_nothing_is_said_when_the_reader_of_the_output_has_gone(line):
+    done = subprocess.run(
+        ["sh", "-c", f"{UPRIGHT} {line} | true"], capture_output=True, text=True, timeout=60
+    )
+    assert "Traceback" not in done.stderr and "Exception" not in done.stderr
+
+
+@pytest.mark.parametrize("columns", ["20", "200"])
+def test_no_figure_is_cut_on_a_narrow_terminal(upright, trial, monkeypatch, columns):
+    monkeypatch.setenv("COLUMNS", columns)
+    said = upright("score", trial, "--filters", "mahony6", "--seconds", 2).output
+    assert re.search(r"mahony6 .*\d\.\d\d +\d\.\d\d", said)
+    assert "\u2026" not in said
+
+
+def test_without_a_cache_there_is_cpython_and_a_reason():
+    def demo(*more):
+        return subprocess.run(
+            [UPRIGHT, "demo", "--headless", "--seconds", "2", *more],
+            env=os.environ | {"UPRIGHT_CACHE": "/dev/null/x"},
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
+
+    assert "ran on cpython" in demo().stdout
+    done = demo("--runtime", "unix")
+    assert (done.returncode, done.stdout) == (3, "")
+    assert "the cache /dev/null/x cannot be made (Not a directory)" in done.stderr
+
+
+def test_a_current_folder_that_has_been_removed_is_named(upright, trial, tmp_path, monkeypatch):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    done = upright("tune", "kalman", trial, "--source", "mahony6")
+    assert done.exit_code == 2
+    assert done.stderr == "the current folder has been removed\n"
+    monkeypatch.chdir(tmp_path)

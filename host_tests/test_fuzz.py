@@ -1,6 +1,7 @@
 """Whatever a file holds, the answer is its contents or one clear line: ten thousand inputs for each parser, and in
 `make soak` a million. Input number N of a parser is the same in every run."""
 
+import inspect
 import io
 import json
 import os
@@ -22,7 +23,9 @@ from upright import dmp as mpu_dmp
 from upright_host import (
     contents,
     dmp,
+    faults,
     flash,
+    library,
     mag_fit,
     paths,
     recordings,
@@ -330,6 +333,33 @@ def board_py(folder):
             contents.setting(decoded, "PLATFORM")
         except ValueError as why:
             refused(why)
+
+    return one
+
+
+@parser
+def plan_of_faults(folder):
+    plan = [
+        [1000, "imu", "nack", None, 3, 1],
+        [2000, "imu", "swapped", 500, 112],
+        [3000, "bus", "low", 400, "scl"],
+    ]
+    plan += [[4000, "bus", "raise", None, "OSError"], [5000, "imu", "stuck_axis", 100, 1, 32767]]
+    parts = dict.fromkeys(("imu", "display", "bus"), object())
+    file = folder / "plan.json"
+
+    def one(rng):
+        made = damaged(rng, as_json(plan)) if rng.random() < 0.4 else None
+        file.write_bytes(made or as_json(damaged_value(rng, plan)))
+        try:
+            (case,) = faults._cases((), file)
+        except Wrong as why:
+            return refused(why)
+        library.simulator("faults").Plan(case.faults, parts)
+        for _, on, name, _, *values in case.faults:
+            begin = library.simulator("faults").FAULTS[name][0]
+            if name not in ("brown_out", "jam", "swapped"):
+                inspect.signature(begin).bind(None, on, *values)
 
     return one
 

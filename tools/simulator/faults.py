@@ -191,6 +191,38 @@ FAULTS = {
     "read_only": (_read_only, _disk_well, "board"),
 }
 
+# The values of those that take some: how many at least, then for each its least and most, or its names
+_NAMES = tuple(EXCEPTIONS)
+_VALUES = {
+    "nack": (0, (1, 10000), (0, 10000)),
+    "swapped": (1, (0, 0xFF)),
+    "flip": (2, (0, 0x7F), (0, 0xFF)),
+    "stuck_axis": (1, (0, 5), (0, 0xFFFF)),
+    "magnet": (3, (-32768, 32767), (-32768, 32767), (-32768, 32767)),
+    "low": (0, ("sda", "scl")),
+    "raise": (1, _NAMES),
+    "raise_in_main": (1, _NAMES),
+    "raise_in_on_step": (1, _NAMES),
+}
+_MOST_US = 10**12
+
+
+def _is_us(value, least=0):
+    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= _MOST_US
+
+
+def _check_values(entry):
+    least, *kinds = _VALUES.get(entry[2], (0,))
+    values = entry[4:]
+    if not least <= len(values) <= len(kinds):
+        raise ValueError("%r: it takes %d to %d values" % (entry, least, len(kinds)))
+    for value, kind in zip(values, kinds):
+        if isinstance(kind[0], str):
+            if value not in kind:
+                raise ValueError("%r: %r is not one of %s" % (entry, value, ", ".join(kind)))
+        elif not isinstance(value, int) or not kind[0] <= value <= kind[1]:
+            raise ValueError("%r: %r is no int from %d to %d" % (entry, value, kind[0], kind[1]))
+
 
 def check(plan):
     """Raise ValueError for an entry that is none, with what is wrong."""
@@ -200,14 +232,15 @@ def check(plan):
         if not isinstance(entry, list) or len(entry) < 4:
             raise ValueError("%r is not [at_us, on, fault, for_us, value...]" % (entry,))
         at, on, name, lasts = entry[:4]
-        if name not in FAULTS:
+        if not isinstance(name, str) or name not in FAULTS:
             raise ValueError("no fault %r; there are %s" % (name, ", ".join(sorted(FAULTS))))
-        if on not in FAULTS[name][2].split():
+        if not isinstance(on, str) or on not in FAULTS[name][2].split():
             raise ValueError("%s can be on %s, not on %r" % (name, FAULTS[name][2], on))
-        if not isinstance(at, int) or at < 0 or not (lasts is None or isinstance(lasts, int)):
+        if not _is_us(at) or not (lasts is None or _is_us(lasts, 1)):
             raise ValueError("%r: at_us and for_us are whole microseconds" % (entry,))
         if name == "swapped" and lasts is None:
             raise ValueError("%r: another chip comes after for_us" % (entry,))
+        _check_values(entry)
 
 
 class Plan:

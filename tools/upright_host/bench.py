@@ -295,7 +295,7 @@ def _show(title: str, lines: Iterable[tuple[str, ...]]) -> None:
         table.add_column(text, justify="right" if k else "left")
     for row in body:
         table.add_row(*row)
-    console.out.print(table)
+    console.show(table)
 
 
 def register(app: typer.Typer) -> None:
@@ -322,7 +322,7 @@ def register(app: typer.Typer) -> None:
             table.add_column(column, justify="left" if column == "board" else "right")
         for board, *numbers in contents.sizes():
             table.add_row(board, *(f"{number:,}" for number in numbers))
-        console.out.print(table)
+        console.show(table)
         if save_to:
             save(figures, save_to)
         of = figures.instructions

@@ -1,5 +1,6 @@
 """The command line `upright`: its commands by group, and those two that belong to no other module."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -29,6 +30,9 @@ from upright_host import (
     simulate,
     tune,
 )
+
+_LARGEST_PROGRAM = 1 << 20  # bytes
+_LARGEST_IMAGE = 16 << 20  # an .uf2 has twice the bytes of the flash
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -87,6 +91,10 @@ def exec_file(
 
     Options of this command stand before FILE. Ctrl-C ends the program.
     """
+    try:
+        console.contents(file, _LARGEST_PROGRAM).decode()
+    except UnicodeDecodeError as why:
+        raise console.Wrong(f"{file} is no program: {why}") from None
     runtime = runtime or simulate.best_runtime()
     argv, environment = runtimes.program(runtime, file, args or (), board, seconds)
     with calibrate.untouched():
@@ -104,6 +112,7 @@ def list_runtimes(
     """Obtain and list the interpreters that the portable code is tested on, and the emulated board's firmware."""
     if image:
         try:
+            console.contents(image, _LARGEST_IMAGE)
             rp2040.take(image)
         except runtimes.Unavailable as why:
             raise console.Wrong(str(why)) from None
@@ -123,7 +132,7 @@ def list_runtimes(
             table.add_row(name, version, runtimes.what(name))
         except runtimes.Unavailable as why:
             table.add_row(name, "-", f"not here: {why}")
-    console.out.print(table)
+    console.show(table)
 
 
 # The groups of `upright --help`, in their order
@@ -141,7 +150,10 @@ app.registered_commands.sort(key=lambda command: list(_GROUPS).index(command.ric
 
 
 def main():
-    for stream in (sys.stdout, sys.stderr):
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by whoever started us
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+        stream = getattr(sys, name)
         stream.reconfigure(errors="replace")  # Windows: a pipe does not take the display's dots
     app()
 

@@ -189,7 +189,7 @@ def table(comparison: Comparison) -> Table:
 def show(comparison: Comparison) -> None:
     console.say(f"\n{comparison.trial.name}", "bold")
     if comparison.lines:
-        console.out.print(table(comparison))
+        console.show(table(comparison))
     if not comparison.trial.has_truth:
         score.say_notes(["no truth in this trial: no errors to tell"])
     elif comparison.lines and not any(line.row.score.samples for line in comparison.lines):

@@ -105,8 +105,25 @@ def writing(path):
         raise Wrong(f"{path} cannot be written: {why.strerror or why}") from None
 
 
+def contents(path, most: int) -> bytes:
+    """What is in a file that people name. Raises Wrong for more than `most` bytes, which no file of its kind has."""
+    with open(path, "rb") as file:
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise Wrong(f"{path} has more than {most} bytes, as no file of its kind")
+    return data
+
+
+def show(table) -> None:
+    """A table. Its numbers are not cut on a narrow terminal, and nothing is folded where there is none."""
+    wanted = out.measure(table, options=out.options.update(width=1000)).maximum
+    Console(width=max(out.width, min(wanted, 80) if out.is_terminal else wanted)).print(table)
+
+
 def reason(why: OSError) -> str:
     """FILE: what is wrong with it."""
+    if why.errno == errno.ENOENT and not why.filename:
+        return "the current folder has been removed"
     return f"{why.filename}: {why.strerror}" if why.filename and why.strerror else str(why)
 
 

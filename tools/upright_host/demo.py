@@ -319,7 +319,7 @@ def register(app: typer.Typer) -> None:
             for line in summary(outcomes[-1]):
                 console.say(line)
         if len(outcomes) > 1:
-            console.out.print(compare(outcomes))
+            console.show(compare(outcomes))
         for what, path, save in (("picture", png, save_png), ("animation", gif, save_gif)):
             if path:
                 with console.writing(path):

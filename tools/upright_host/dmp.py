@@ -35,6 +35,7 @@ _ARRAY = re.compile(
     r"|(\w+)\s*=\s*(?:bytes|bytearray)?[\[(]+([^\[\]()]*)[\])]"
 )
 _TEXT_TO_LOOK_AT = 4096
+_LARGEST = 1 << 20  # bytes: an image as the text of a program has 20 kB
 
 
 class ImageError(Wrong):
@@ -54,9 +55,11 @@ def read(files: list[Path]) -> tuple[bytes, list[str]]:
     parts, names = [], []
     for path in files:
         try:
-            data = path.read_bytes()
+            data = console.contents(path, _LARGEST)
         except OSError as why:
             raise ImageError(f"{path}: {why.strerror or why}") from why
+        except Wrong as why:
+            raise ImageError(str(why)) from why
         if not data:
             raise ImageError(f"{path} is empty")
         if is_text(data):

@@ -231,6 +231,7 @@ class Rig:
         return faulty, judge(case, faulty, self.clean(case))
 
 
+_LARGEST_PLAN = 1 << 20  # bytes
 _COUNTERS = "missed crashes step_errors errors resets full_resets fifo_overflows display_errors"
 
 
@@ -243,10 +244,14 @@ def _counted(result) -> str:
 def _cases(names, file) -> list[Case]:
     if file:
         try:
-            faults = json.loads(file.read_text())
+            faults = json.loads(console.contents(file, _LARGEST_PLAN))
             library.simulator("faults").check(faults)
+        except RecursionError:
+            raise Wrong(f"{file}: too deep") from None
         except (OSError, ValueError) as why:
-            raise Wrong(f"{file}: {why}") from None
+            raise Wrong(str(why) if isinstance(why, Wrong) else f"{file}: {why}") from None
+        if any(on == "mag" for _, on, *_ in faults):
+            raise Wrong(f"{file}: the simulated board has no mag")
         last = max((begin if end is None else end for begin, end in ends(faults)), default=0)
         return [Case(file.name, faults, seconds=max(8, last / SECOND + 4))]
     unknown = [name for name in names or () if name not in PLANS]
@@ -275,7 +280,7 @@ def register(app: typer.Typer) -> None:
                 table.add_column(column)
             for case in cases:
                 table.add_row(case.name, case.text, json.dumps(case.faults))
-            console.out.print(table)
+            console.show(table)
             return
         runtime = runtime or simulate.best_runtime()
         failed = 0

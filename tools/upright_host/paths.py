@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from upright_host import lock
-from upright_host.console import Wrong
+from upright_host.console import Unavailable, Wrong
 
 ROOT = Path(__file__).resolve().parents[2]
 LIB = ROOT / "lib"
@@ -19,13 +19,21 @@ SHIM = SIMULATOR / "shim"
 
 
 def cache() -> Path:
-    """The cache folder: UPRIGHT_CACHE, else XDG_CACHE_HOME/upright, else ~/.cache/upright. It is made when missing."""
+    """The cache folder: UPRIGHT_CACHE, else XDG_CACHE_HOME/upright, else ~/.cache/upright. It is made when missing.
+
+    Raises Unavailable where that cannot be.
+    """
     folder = os.environ.get("UPRIGHT_CACHE")
     if not folder:
         base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         folder = Path(base) / "upright"
     folder = Path(folder).absolute()
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as why:
+        raise Unavailable(
+            f"the cache {folder} cannot be made ({why.strerror}); UPRIGHT_CACHE may name another folder"
+        ) from None
     return folder
 
 

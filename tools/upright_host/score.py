@@ -347,14 +347,14 @@ def show(report: Report) -> None:
     """The tables and what was left out, for people."""
     for trial in report.names("trial"):
         console.say(f"\n{trial}", "bold")
-        console.out.print(trial_table(report, trial))
+        console.show(trial_table(report, trial))
     if report.notes:
         console.say()
     say_notes(report.notes)
     trials_in_all = len(report.names("trial"))
     over = f"over {trials_in_all} trial" + "s" * (trials_in_all != 1)
     console.say("\n" + over, "bold")
-    console.out.print(summary_table(report))
+    console.show(summary_table(report))
     console.say(
         "heading and total: as given for nine axes where the truth knows north, else after the best constant heading",
         "dim",

@@ -322,7 +322,7 @@ def register(app: typer.Typer) -> None:
             found = scan(of, pairs, jobs, at)
         title = f"{loaded.name}: {axis} of {_source(of)}, {len(of.z)} samples at {of.rate:.1f} Hz"
         console.say(title, "bold")
-        console.out.print(table(found))
+        console.show(table(found))
         for line in remarks(of, found):
             console.say(line)
         if csv:
