@@ -602,6 +602,50 @@ def test_three_hundred_ctrl_c_never_end_the_tick(image, version):
     board.exec("imu.stop()")
 
 
+HANGS = b"""
+import machine
+import upright
+first = machine.reset_cause() != machine.WDT_RESET
+def hang(imu):
+    while first and imu.tick.steps > 240:
+        pass
+make = upright.from_board
+upright.from_board = lambda **more: make(on_step=hang, **more)
+from upright_app import app
+application = app.App()
+application.run()
+"""
+
+
+def test_the_watchdog_lets_a_healthy_run_be_and_resets_a_board_whose_step_hangs(image, version):
+    """After 1.2 s, more than the time-out, the control loop never returns to the program."""
+    settings = "WATCHDOG_MS = 1000\nMEASURE_BIAS = False\nFILTER = 'mahony6'\n"
+    files = emulated.project(version, "pico", settings)
+    files["main.py"] = HANGS
+    board = rp2040.Board(image, files)
+    world = StillWorld((0, 0, 4096))
+    bus = board.i2c(0, sda=4, scl=5)
+    bus.add(MPU6050Chip(world))
+    bus.add(SSD1306Chip())
+    board.boot()
+    board.start(world)
+    board.expect("resets the board after 1000 ms", 20)
+    assert "started by: power-on" in board.console
+    board.run(1.1)
+    before = bus.transfers
+    board.run(0.05)
+    assert bus.transfers - before >= 9  # it still steps
+    assert board.resets == 0
+    board.run_until(lambda: board.resets == 1, 2, "reset by the watchdog")
+    board.expect("started by: watchdog", 20)
+    board.expect("resets the board after 1000 ms", 20)
+    board.run(1.2)
+    assert board.resets == 1
+    board.interrupt()
+    steps, fresh = steps_and_fresh(board)
+    assert steps == fresh > 220
+
+
 # ---------------------------------------------------------------- the bench: the emulated board itself
 class Register:
     """A chip of 256 registers, on I2C and SPI, that takes notes."""
