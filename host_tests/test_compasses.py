@@ -1,34 +1,23 @@
-"""The drivers of AK8963, HMC5883L and QMC5883L behind an MPU, in bypass and on the main bus; the search for them."""
+"""The drivers of all magnetometers behind an MPU, in bypass and on the main bus; the search for them."""
 
-from itertools import pairwise
+import itertools
 
+import compasses
 import kernel
 import machine
 import pytest
-from chips.ak8963 import AK8963Chip
-from chips.hmc5883l import HMC5883LChip
-from chips.ist8310 import IST8310Chip
-from chips.qmc5883l import QMC5883LChip
+from compasses import BEHIND, FRESH, KINDS, MAG_FRESH, gaps, still
 from imus import RIGS
 from upright import magnetometers, settings
 from upright.ak8963 import AK8963, AK8963Error
 from upright.auxiliary_bus import AuxiliaryBus
-from upright.hmc5883l import HMC5883L, HMC5883LError
 from upright.ist8310 import IST8310
 from upright.magnetometers import MagnetometerNotFound
-from upright.qmc5883l import QMC5883L, QMC5883LError
 from world import StillWorld
 
-FRESH, MAG_FRESH = 1, 2
 FIELD = (99, -198, 66)  # counts of the world, 3.3 per uT: 30, -60, 20 uT
 MICROTESLA = (30, -60, 20)
-INT_PIN_CFG, PWR_MGMT_1 = 0x37, 0x6B
-# driver, model, a configuration register and what it holds
-KINDS = {
-    "AK8963": (AK8963, AK8963Chip, AK8963Error, 0x0C, 0x00, 0x40),
-    "HMC5883L": (HMC5883L, HMC5883LChip, HMC5883LError, 0x00, 0x18, 0x38),
-    "QMC5883L": (QMC5883L, QMC5883LChip, QMC5883LError, 0x0B, 0x01, 0x00),
-}
+INT_PIN_CFG = 0x37
 PLACES = ("spi", "behind", "bypass", "main bus")
 
 
@@ -41,65 +30,15 @@ class Noisy(StillWorld):
         return row
 
 
-class Rig:
-    """An IMU, a magnetometer at one of the PLACES, and the tick of the firmware."""
-
+class Rig(compasses.Rig):
     def __init__(self, name, place, rate=1000, **options):
-        self.driver, model, self.error, *self.row = KINDS[name]
-        self.place = place
-        self.world = Noisy((10, -20, 4096, 5, 6, -7, *FIELD, -521))
-        self.rate = rate
-        self.period = 1_000_000 // rate
-        kind = RIGS["MPU6500" if place == "spi" else "MPU6050"]
-        self.chip, self.imu = kind.running(self.world, rate)
-        self.mag_chip = model(self.world, **options)
-        if place == "main bus":
-            machine.wire_i2c(0, self.mag_chip)
-        else:
-            self.chip.aux.append(self.mag_chip)
-        if place == "bypass":
-            self.imu.set_bypass()
-        self.i2c = machine.I2C(0, freq=400_000)
-        behind = place in ("spi", "behind")
-        self.mag = self.driver(AuxiliaryBus(self.imu) if behind else self.i2c)
-        self.steps = 0
-
-    def configure(self, **arguments):
-        self.mag.configure(sample_rate=self.rate if self.mag.own_bus else None, **arguments)
-
-    def start(self, **arguments):
-        self.configure(**arguments)
-        self.until(MAG_FRESH)
-
-    def tick(self, health=True):
-        kernel.advance(self.period - kernel.now() % self.period)
-        self.imu.read()
-        if self.mag.own_bus:
-            self.mag.read(self.imu.counts)
-        flags = self.imu.counts[10]
-        self.steps += 1
-        if health and (not flags & FRESH or not self.steps % 8):
-            self.imu.health()
-        return flags
-
-    def run(self, n):
-        return [i for i in range(n) if self.tick() & MAG_FRESH]
-
-    def until(self, bit, most=2000):
-        start = kernel.now()
-        for _ in range(most):
-            if self.tick() & bit:
-                return kernel.now() - start
-        raise AssertionError(f"no bit {bit} in {most} ticks")
+        world = Noisy((10, -20, 4096, 5, 6, -7, *FIELD, -521))
+        super().__init__(name, place, world, rate, **options)
 
 
 @pytest.fixture(params=[(name, place) for name in KINDS for place in PLACES], ids="-".join)
 def rig(request):
     return Rig(*request.param)
-
-
-def gaps(ticks):
-    return {b - a for a, b in pairwise(ticks)}
 
 
 # Samples
@@ -109,7 +48,7 @@ def test_every_measurement_is_delivered_once_in_microtesla(rig):
     rig.start()
     ticks = rig.run(1000)
     assert len(ticks) in (99, 100, 101)
-    assert gaps(ticks) <= {9, 10, 11}
+    assert gaps(ticks) <= rig.gaps
     assert rig.mag.field() == pytest.approx(MICROTESLA, abs=0.9)
     assert rig.mag_chip.measurements - rig.mag.fresh in (0, 1, 2)
     assert (rig.mag.stale, rig.mag.saturated) == (0, 0)
@@ -137,6 +76,8 @@ def test_another_field_is_seen_within_two_measurements(rig):
 
 @pytest.mark.parametrize("field", [(20_000, 0, 0), (0, -20_000, 0), (0, 0, 20_000)])
 def test_a_field_beyond_the_range_is_withheld_and_counted(rig, field):
+    if rig.mag.chip == "IST8310" and field[2]:
+        pytest.skip("its 14 bits end before the range of z: test_ist8310.py")
     rig.start()
     rig.world.set((0, 0, 4096, 0, 0, 0, *field))
     rig.run(25)
@@ -150,9 +91,9 @@ def test_a_field_beyond_the_range_is_withheld_and_counted(rig, field):
 
 
 def test_the_fifo_carries_it_too():
-    for name in KINDS:
+    for name, place in itertools.product(KINDS, BEHIND):
         machine.power_on()
-        rig = Rig(name, "behind")
+        rig = Rig(name, place)
         rig.configure()
         rig.imu.fifo_enable(batch=10)
         fresh = packets = 0
@@ -248,7 +189,7 @@ def test_the_qmc5883l_takes_the_next_lower_of_its_rates(rate_hz, sample_rate, ch
 def test_an_absent_one_is_named_in_good_time(rig):
     rig.mag_chip.vanish()
     start = kernel.now()
-    with pytest.raises(rig.error, match=f"no {rig.mag.chip} at 0x"):
+    with pytest.raises(rig.error, match=rf"no {rig.mag.chip} at 0x..{rig.where} \("):
         rig.configure()
     assert kernel.now() - start < 250_000
     assert not rig.mag.present
@@ -321,7 +262,7 @@ def test_absent_at_the_start_it_is_found_and_configured_by_the_tick(rig):
     assert rig.until(MAG_FRESH) < 500_000
     register, value, _ = rig.row
     assert rig.mag_chip.register(register) == value
-    assert gaps(rig.run(300)) <= {9, 10, 11}
+    assert gaps(rig.run(300)) <= rig.gaps
     assert rig.imu.resets == 0
 
 
@@ -335,7 +276,7 @@ def test_vanishing_in_flight_and_coming_back(rig):
     rig.mag_chip.come_back()
     assert rig.until(MAG_FRESH) < 500_000
     rig.run(50)
-    assert gaps(rig.run(300)) <= {9, 10, 11}
+    assert gaps(rig.run(300)) <= rig.gaps
 
 
 def test_a_reset_of_the_magnetometer_alone_is_noticed_and_mended(rig):
@@ -345,7 +286,7 @@ def test_a_reset_of_the_magnetometer_alone_is_noticed_and_mended(rig):
     rig.run(500)
     register, value, _ = rig.row
     assert rig.mag_chip.register(register) == value
-    assert gaps(rig.run(300)) <= {9, 10, 11}
+    assert gaps(rig.run(300)) <= rig.gaps
     assert rig.imu.resets == rig.imu.errors == 0
 
 
@@ -356,7 +297,7 @@ def test_a_register_that_lost_its_value_is_mended(rig):
     rig.run(500)
     assert rig.mag_chip.register(register) == value
     assert rig.mag.resets == 1
-    assert gaps(rig.run(300)) <= {9, 10, 11}
+    assert gaps(rig.run(300)) <= rig.gaps
 
 
 def test_an_identity_that_reads_wrong_stops_delivery_until_it_is_right(rig):
@@ -390,19 +331,19 @@ def test_a_storm_of_missing_acknowledges_costs_measurements_and_nothing_else(rig
     assert rig.until(MAG_FRESH) < 500_000
     assert rig.imu.resets == rig.imu.errors == 0
     rig.run(500)
-    assert gaps(rig.run(300)) <= {9, 10, 11}
+    assert gaps(rig.run(300)) <= rig.gaps
 
 
 # Search
 
 
 @pytest.mark.parametrize("place", PLACES)
-@pytest.mark.parametrize("name", [*KINDS, "IST8310"])
+@pytest.mark.parametrize("name", KINDS)
 @pytest.mark.parametrize("wanted", ["auto", "by name"])
 def test_each_is_found_wherever_it_is(name, place, wanted):
-    world = StillWorld((10, -20, 4096, 5, 6, -7, *FIELD, -521))
+    world = still(FIELD)
     chip, imu = RIGS["MPU6500" if place == "spi" else "MPU6050"].running(world)
-    mag_chip = IST8310Chip(world) if name == "IST8310" else KINDS[name][1](world)
+    mag_chip = KINDS[name][1](world)
     if place == "main bus":
         machine.wire_i2c(0, mag_chip)
     else:
@@ -468,7 +409,7 @@ def test_the_table_of_the_search_is_the_drivers():
 # On the real interpreters
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", [name for name in KINDS if name != "IST8310"])  # test_ist8310.py
 def test_the_tick_allocates_nothing(micropython_runtime, portable, name):
     lines = portable(micropython_runtime, "compass_alloc.py", name).splitlines()
     assert len(lines) == 5

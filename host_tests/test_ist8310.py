@@ -1,19 +1,18 @@
 """The IST8310 driver behind an MPU and on a bus of its own: each measurement once, and what goes wrong."""
 
 from array import array
-from itertools import pairwise
 
+import compasses
 import kernel
 import machine
 import pytest
 from chips.ist8310 import IST8310Chip
-from imus import RIGS
+from compasses import BEHIND, FRESH, MAG_FRESH, gaps, still
 from upright.auxiliary_bus import AuxiliaryBus
 from upright.ist8310 import IST8310, IST8310Error
 from upright.registers import I2CRegisters
 from world import StillWorld
 
-FRESH, MAG_FRESH = 1, 2
 FIELD = (100, -200, 300)
 WAI, STAT1, CNTL1, CNTL2, AVGCNTL, PDCNTL = 0x00, 0x02, 0x0A, 0x0B, 0x41, 0x42
 SLV4_CTRL, PWR_MGMT_1 = 0x34, 0x6B
@@ -27,59 +26,9 @@ class Moving(StillWorld):
         return self._row
 
 
-class Rig:
-    """An IMU with an IST8310 behind it, or on a bus of its own, and the tick of the firmware: read, and health now and
-    then."""
-
-    def __init__(self, kind, world=None, rate=1000):
-        self.world = world or StillWorld((10, -20, 4096, 5, 6, -7, *FIELD, -521))
-        rig = RIGS[{"spi": "MPU6500", "6500 on i2c": "MPU6500_I2C"}.get(kind, "MPU6050")]
-        self.chip, self.imu = rig.running(self.world, rate)
-        self.mag_chip = IST8310Chip(self.world)
-        self.rate = rate
-        self.period = 1_000_000 // rate
-        if kind == "own bus":
-            self.bus = machine.wire_i2c(1, self.mag_chip)
-            self.where = ""
-            self.mag = IST8310(machine.I2C(1, freq=400_000))
-        else:
-            self.chip.aux.append(self.mag_chip)
-            self.where = f" behind the {self.imu.chip}"
-            self.mag = IST8310(AuxiliaryBus(self.imu))
-        self.steps = 0
-
-    def configure(self, **arguments):
-        self.mag.configure(sample_rate=self.rate if self.mag.own_bus else None, **arguments)
-
-    def start(self):
-        self.configure()
-        self.until(MAG_FRESH)
-
-    def tick(self, health=True):
-        kernel.advance(self.period - kernel.now() % self.period)
-        self.imu.read()
-        if self.mag.own_bus:
-            self.mag.read(self.imu.counts)
-        flags = self.imu.counts[10]
-        self.steps += 1
-        if health and (not flags & FRESH or not self.steps % 8):
-            self.imu.health()
-        return flags
-
-    def run(self, n):
-        """The ticks (0..n-1) that had a fresh measurement."""
-        return [i for i in range(n) if self.tick() & MAG_FRESH]
-
-    def until(self, bit, most=2000):
-        """Microseconds until a sample has this bit."""
-        start = kernel.now()
-        for _ in range(most):
-            if self.tick() & bit:
-                return kernel.now() - start
-        raise AssertionError(f"no bit {bit} in {most} ticks")
-
-
-BEHIND = ("spi", "i2c", "6500 on i2c")
+class Rig(compasses.Rig):
+    def __init__(self, place, world=None, rate=1000):
+        super().__init__("IST8310", place, world or still(FIELD), rate)
 
 
 @pytest.fixture(params=(*BEHIND, "own bus"))
@@ -90,10 +39,6 @@ def rig(request):
 @pytest.fixture(params=BEHIND)
 def behind(request):
     return Rig(request.param)
-
-
-def gaps(ticks):
-    return {b - a for a, b in pairwise(ticks)}
 
 
 # Set-up
@@ -113,15 +58,6 @@ def test_configure_finds_resets_and_configures_it(rig):
     assert rig.mag.lsb_per_uT == (33, 10)
     assert rig.mag.sample_rate == (100, 1)
     assert rig.chip.misuse == rig.mag_chip.misuse == []
-
-
-def test_an_absent_magnetometer_is_named_in_good_time(rig):
-    rig.mag_chip.vanish()
-    start = kernel.now()
-    with pytest.raises(IST8310Error, match=rf"no IST8310 at 0x0e{rig.where} \("):
-        rig.configure()
-    assert kernel.now() - start < 150_000
-    assert not rig.mag.present
 
 
 def test_a_magnetometer_that_is_late_after_power_up_is_waited_for(rig):
@@ -200,7 +136,7 @@ def test_a_bus_can_be_given_as_the_chips_registers():
     ],
 )
 def test_the_rate_is_the_next_lower_part_of_the_sample_rate(sample_rate, rate_hz, average, n):
-    mag = Rig("i2c").mag
+    mag = Rig("behind").mag
     mag.configure(rate_hz, average, sample_rate)
     num, den = sample_rate if isinstance(sample_rate, tuple) else (sample_rate, 1)
     assert mag.sample_rate[0] * den * n == num * mag.sample_rate[1]
@@ -222,23 +158,10 @@ def test_the_rate_is_the_next_lower_part_of_the_sample_rate(sample_rate, rate_hz
 )
 def test_what_the_chip_cannot_do_is_refused(arguments, what):
     with pytest.raises(ValueError, match=what):
-        Rig("i2c").mag.configure(**arguments)
+        Rig("behind").mag.configure(**arguments)
 
 
 # Samples
-
-
-def test_every_measurement_is_delivered_once(rig):
-    rig.start()
-    ticks = rig.run(1000)
-    assert len(ticks) == 100
-    assert gaps(ticks) == {10}
-    assert tuple(rig.imu.counts[6:9]) == FIELD
-    assert rig.mag.fresh == 101
-    assert rig.mag_chip.measurements - rig.mag.fresh in (0, 1)
-    assert (rig.mag.stale, rig.mag.saturated, rig.mag.unflagged) == (0, 0, 0)
-    assert (rig.mag.errors, rig.mag.resets, rig.imu.resets, rig.imu.errors) == (0, 0, 0, 0)
-    assert rig.chip.misuse == rig.mag_chip.misuse == []
 
 
 @pytest.mark.parametrize("kind", ["spi", "own bus"])
@@ -276,23 +199,6 @@ def test_between_measurements_the_words_stay_and_bit_1_is_clear(rig):
     assert tuple(rig.imu.counts[6:9]) == FIELD
     rig.run(25)
     assert tuple(rig.imu.counts[6:9]) == (7, 8, 9)
-
-
-def test_the_fifo_carries_it_too(behind):
-    behind.configure()
-    behind.imu.fifo_enable(batch=10)
-    fresh = packets = 0
-    for _ in range(100):
-        kernel.advance(10_000 - kernel.now() % 10_000)
-        for _ in range(behind.imu.fifo_poll()):
-            flags = behind.imu.fifo_next()
-            packets += flags & FRESH
-            fresh += flags >> 1 & 1
-        behind.imu.health()
-    assert packets > 950
-    assert abs(fresh - packets // 10) <= 2
-    assert behind.imu.fifo_overflows == behind.mag.stale == behind.imu.resets == 0
-    assert tuple(behind.imu.counts[6:9]) == FIELD
 
 
 def test_a_field_beyond_the_range_is_withheld_and_counted(rig):
@@ -335,7 +241,7 @@ def test_the_range_of_each_axis_is_the_data_sheets(axis, most, sign):
 
 @pytest.mark.parametrize("took", range(5500, 6121, 40))
 def test_a_measurement_that_ends_at_any_moment_of_the_round_is_delivered_once_and_whole(took):
-    rig = Rig("i2c", Moving())
+    rig = Rig("behind", Moving())
     rig.configure()
     rig.mag_chip.measure_us = took
     rig.until(MAG_FRESH)
@@ -352,7 +258,7 @@ def test_a_measurement_that_ends_at_any_moment_of_the_round_is_delivered_once_an
 
 def test_without_dren_measurements_are_still_found_by_their_data():
     """The IST8310 example that is widely copied writes CNTL2 = 0, and with it DRDY is never set."""
-    rig = Rig("i2c", Moving())
+    rig = Rig("behind", Moving())
     rig.start()
     rig.mag_chip.poke(CNTL2, 0)
     fresh = rig.mag.fresh
@@ -433,58 +339,6 @@ def test_a_bus_that_nobody_drives_is_no_measurement(rig):
 # Faults in the tick
 
 
-def test_absent_at_the_start_it_is_found_and_configured_by_the_tick(rig):
-    rig.mag_chip.vanish()
-    with pytest.raises(IST8310Error):
-        rig.configure()
-    rig.mag.attach()
-    assert rig.run(500) == []
-    assert rig.imu.counts[10] & FRESH
-    assert rig.imu.errors == rig.imu.resets == 0
-    assert not rig.mag.present
-    assert rig.mag.errors > 5
-    assert rig.mag.stale > (35 if rig.mag.own_bus else 40)
-    rig.mag_chip.come_back()
-    rig.mag_chip.misuse.clear()  # until then it was triggered as it came
-    assert rig.until(MAG_FRESH) < 500_000
-    assert rig.mag.present
-    assert rig.mag.resets == 1
-    assert rig.mag_chip.register(AVGCNTL) == 0x24
-    assert rig.mag_chip.register(PDCNTL) == 0xC0
-    assert gaps(rig.run(300)) == {10}
-    assert rig.imu.resets == 0
-
-
-def test_vanishing_in_flight_and_coming_back(rig):
-    rig.start()
-    rig.mag_chip.vanish()
-    rig.run(2)
-    assert rig.run(1000) == []
-    assert rig.imu.counts[10] & FRESH
-    assert not rig.mag.present
-    assert rig.mag.errors > 10
-    errors = rig.imu.errors
-    rig.mag_chip.come_back()
-    assert rig.until(MAG_FRESH) < 500_000
-    assert rig.mag.resets == 0  # it kept its registers
-    assert rig.imu.errors == errors == 0
-    assert gaps(rig.run(300)) == {10}
-    assert rig.chip.misuse == []
-
-
-def test_a_reset_of_the_magnetometer_alone_is_noticed_and_mended(rig):
-    rig.start()
-    rig.mag_chip.power_up_us = 50_000
-    rig.mag_chip.brown_out(kernel.now())
-    assert rig.until(MAG_FRESH) < 500_000
-    rig.run(500)
-    assert rig.mag.resets == 1
-    assert rig.mag_chip.register(AVGCNTL) == 0x24
-    assert rig.mag_chip.register(PDCNTL) == 0xC0
-    assert gaps(rig.run(300)) == {10}
-    assert rig.imu.resets == rig.imu.errors == 0
-
-
 @pytest.mark.parametrize("both", [False, True])
 def test_a_reset_of_the_imu_in_flight(rig, both):
     rig.start()
@@ -528,15 +382,6 @@ def test_while_a_register_is_wrong_nothing_is_delivered(rig):
     assert rig.mag.resets == 1  # however often it was written
 
 
-def test_one_missing_acknowledge_costs_one_measurement_at_the_most(rig):
-    rig.start()
-    for after in range(0, 90, 3):
-        rig.mag_chip.nack_next(1, after)
-        # a start that was lost is given again when the measurement is overdue: 13 samples and one measurement
-        assert max(gaps(rig.run(60))) <= (24 if rig.mag.own_bus else 21)
-    assert rig.mag.resets == 0
-
-
 def test_one_look_at_a_register_that_fails_costs_nothing(rig, monkeypatch):
     rig.start()
     write = rig.mag_chip.i2c_write
@@ -554,25 +399,6 @@ def test_one_look_at_a_register_that_fails_costs_nothing(rig, monkeypatch):
     assert gaps(rig.run(1000)) == {10}
     assert rig.mag.errors == (len(refused) + 1) // 2 >= 5
     assert rig.mag.present
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_a_storm_of_missing_acknowledges_costs_measurements_and_nothing_else(rig, seed):
-    rig.start()
-    state = seed + 1
-    for _ in range(1000):
-        state = state * 1103515245 + 12345 & 0x7FFFFFFF
-        if state >> 16 & 3 == 0:
-            rig.mag_chip.nack_next(1 + (state >> 20 & 7), after=state >> 24 & 3)
-        assert rig.tick() & FRESH
-    rig.mag_chip.nack_next(0)
-    assert rig.mag.errors > 10
-    assert rig.until(MAG_FRESH) < 500_000
-    assert rig.imu.resets == rig.imu.errors == rig.imu.stale == 0
-    assert rig.mag.fresh < 90
-    rig.run(500)
-    assert gaps(rig.run(300)) == {10}
-    assert rig.chip.misuse == []
 
 
 def test_health_costs_two_accesses_at_the_most(rig, monkeypatch):
