@@ -1,5 +1,6 @@
 """The serial port: one that is not there, not for this user, busy, silent, or gone in the middle."""
 
+import dataclasses
 import grp
 import os
 import pty
@@ -148,6 +149,26 @@ def test_one_compiler_in_the_cache_is_enough(monkeypatch):
 
     monkeypatch.setattr(runtimes, "mpy_cross", mostly_offline)
     assert there in str(contents.find_compiler(FACTS))
+
+
+def test_a_compiler_whose_code_would_hang_is_none(monkeypatch):
+    """mpy-cross 1.25 knows rv32imc, and a C3 loads what it writes."""
+    facts = dataclasses.replace(FACTS, version=(1, 25, 0), architecture="rv32imc")
+    assert "1.25" not in str(contents.find_compiler(facts))
+    old = tuple(v for v in runtimes.MPY_CROSS_VERSIONS if v.startswith("1.25"))
+    monkeypatch.setattr(runtimes, "MPY_CROSS_VERSIONS", old)
+    with pytest.raises(runtimes.Unavailable, match="compiles wrongly for rv32imc") as why:
+        contents.find_compiler(facts)
+    assert "--source" not in str(why.value)
+
+
+def test_sources_are_not_put_onto_a_board_that_compiles_them_wrongly():
+    facts = dataclasses.replace(FACTS, version=(1, 25, 0), architecture="rv32imc")
+    with pytest.raises(device.DeviceError, match=r"1\.25.*rv32imc wrongly.*without --source"):
+        contents.board_files("esp32_c3", facts, source=True)
+    for version, architecture in (((1, 26, 1), "rv32imc"), ((1, 25, 0), "armv6m")):
+        right = dataclasses.replace(FACTS, version=version, architecture=architecture)
+        assert "lib/upright/tick.py" in contents.board_files("esp32_c3", right, source=True)
 
 
 def test_an_emulated_board_that_cannot_be_built_here_is_answered_with_a_finished_image(

@@ -72,8 +72,8 @@ def motion(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def files(version):
-    return emulated.project(version, "pico", rp2040.TELL + "PAGE_SECONDS = 0\nFILTER = 'mahony6'\n")
+def files():
+    return emulated.project("pico", rp2040.TELL + "PAGE_SECONDS = 0\nFILTER = 'mahony6'\n")
 
 
 @pytest.fixture(scope="module")
@@ -330,7 +330,7 @@ KERNELS = ("earth", "euler", "inertial", "mahony", "quaternion")
 
 
 def test_every_filter_has_cpython_s_bits_with_kernels_that_the_board_has_compiled_itself(
-    image, version, portable, tmp_path
+    image, portable, tmp_path
 ):
     """As mip installs them. All filters in one boot, 200 samples each: attitudes, biases, every word of the state."""
     import motions
@@ -339,12 +339,12 @@ def test_every_filter_has_cpython_s_bits_with_kernels_that_the_board_has_compile
     world, out, options = (tmp_path / name for name in ("world.imu", "out", "options.json"))
     motions.render("bursts", rate=(200, 1), seconds=1, seed=5).write(world)
     options.write_text('{"mag_every": 3}')
-    files = emulated.project(version, application=False)
+    files = emulated.project(application=False)
     for kernel in KERNELS:
         del files[f"lib/upright/{kernel}_kernels.mpy"]
         source = paths.PACKAGE / f"{kernel}_kernels.py"
         files[f"lib/upright/{source.name}"] = source.read_bytes()
-    cross = emulated.mpy_cross(version)
+    cross = emulated.mpy_cross()
     script = Path(__file__).parent / "portable" / "filter_history.py"
     for path in (paths.SIMULATOR / "world.py", script):
         files[f"{path.stem}.mpy"] = emulated.compile_module(path, cross)
@@ -392,11 +392,9 @@ timing.machine = Before
     ],
     ids=["fifo", "data_ready", "before 1.26"],
 )
-def test_no_sample_is_lost_with_another_drive(image, version, motion, settings, says):
+def test_no_sample_is_lost_with_another_drive(image, motion, settings, says):
     """Display and sensor on one bus, the default filter, all other settings as they are shipped."""
-    board = rp2040.Board(
-        image, emulated.project(version, "pico", f"{settings}\nMEASURE_BIAS = False\n")
-    )
+    board = rp2040.Board(image, emulated.project("pico", f"{settings}\nMEASURE_BIAS = False\n"))
     bus, board.world = board.i2c(0, sda=4, scl=5), World(motion[0])
     imu, oled = bus.add(MPU6050Chip(board.world)), bus.add(SSD1306Chip())
     board.data_ready(6, imu)
@@ -435,14 +433,14 @@ NINE_S = 1.0
 
 
 @pytest.fixture(scope="module")
-def nine(image, version, tmp_path_factory):
+def nine(image, tmp_path_factory):
     """MPU6500 and IST8310 on the SPI peripheral, main.py for NINE_S seconds in slow motion, then interrupted."""
     import motions
 
     path = tmp_path_factory.mktemp("nine") / "slow.imu"
     motion = motions.render("slow", rate=(1000, 1), seconds=3)
     motion.write(path)
-    files = emulated.project(version)
+    files = emulated.project()
     files["board.py"] = (Path(rp2040.__file__).parent / "spi_board.py").read_bytes()
     board = rp2040.Board(image, files)
     board.motion = motion
@@ -532,8 +530,8 @@ def test_the_fifo_drive_in_a_hard_interrupt_loses_nothing(nine):
 
 
 # ---------------------------------------------------------------- a program of one's own
-def test_a_program_with_asyncio_gets_readings_step_by_step_beside_its_other_tasks(image, version):
-    files = emulated.project(version)
+def test_a_program_with_asyncio_gets_readings_step_by_step_beside_its_other_tasks(image):
+    files = emulated.project()
     files["main.py"] = (paths.ROOT / "docs" / "examples" / "with_asyncio.py").read_bytes()
     board = rp2040.Board(image, files)
     world = StillWorld((0, 0, 4096))
@@ -574,10 +572,10 @@ while caught < 200:
 """
 
 
-def test_three_hundred_ctrl_c_never_end_the_tick(image, version):
+def test_three_hundred_ctrl_c_never_end_the_tick(image):
     """They come at any time, also in the hard interrupt. The program ends after 200 of them, or where one lands in the
     second handler; the tick goes on beside the prompt."""
-    files = emulated.project(version)
+    files = emulated.project()
     files["main.py"] = INTERRUPTED
     board = rp2040.Board(image, files)
     world = StillWorld((0, 0, 4096))
@@ -867,13 +865,13 @@ def test_the_data_ready_line_interrupts_hard_with_every_sample(bench):
     assert all(abs(gap - PERIOD_US) < 30 for gap in gaps)
 
 
-def test_modules_compiled_for_another_machine_are_refused(bench, version, tmp_path):
+def test_modules_compiled_for_another_machine_are_refused(bench, tmp_path):
     """The failing twin of every .mpy that the flight runs."""
     module = tmp_path / "probe.py"
     module.write_text(
         "import micropython\n@micropython.viper\ndef f(x: int) -> int:\n    return x + 1\n"
     )
-    cross = emulated.mpy_cross(version)
+    cross = emulated.mpy_cross()
     right = emulated.compile_module(module, cross)
     for data, expected in ((right, "2"), (right[:2] + bytes([right[2] ^ 0x30]) + right[3:], "no")):
         said = bench.exec(
@@ -936,7 +934,7 @@ def test_machine_reset_boots_again_with_its_files(bench):
 
 
 # ---------------------------------------------------------------- cycles
-def test_cycles_are_counted_between_a_programs_marks(image, version, tmp_path):
+def test_cycles_are_counted_between_a_programs_marks(image, tmp_path):
     source = tmp_path / "counts.py"
     source.write_text(
         "import sys\n"
@@ -954,7 +952,7 @@ def test_cycles_are_counted_between_a_programs_marks(image, version, tmp_path):
         "        spin(steps * each)\n"
         "        print('@end %s %d' % (part, steps))\n"
     )
-    files = {"counts.mpy": emulated.compile_module(source, emulated.mpy_cross(version))}
+    files = {"counts.mpy": emulated.compile_module(source, emulated.mpy_cross())}
     of = tracing.per_step(rp2040.between_marks(image, files, "counts", "trace", 100))
     assert of.keys() == {"less", "more"}
     assert 100 * 3 < of["less"] < 100 * 30

