@@ -33,12 +33,12 @@ def board(panel="SSD1306 128x64", int_pin=6, hz=400_000, soft=False, **settings)
     )
 
 
-def wire(sh1106=False):
+def wire(sh1106=False, int_pin=6):
     chip = MPU6050Chip(StillWorld(LEVEL))
     display = SSD1306Chip(sh1106=sh1106)
     machine.wire_i2c(0, chip, 5, 4)
     machine.wire_i2c(0, display, 5, 4)
-    machine.wire_pin(6, chip)
+    machine.wire_pin(int_pin, chip)
     kernel.advance(200_000)
     return display
 
@@ -87,6 +87,19 @@ def test_an_int_line_that_is_not_wired_matters_to_the_drive_that_needs_it(capsys
     )
     (problem,) = doctor.report(board(int_pin=9, DRIVE="data_ready"))
     assert "is INT wired to the pin of data_ready_pin()?" in problem
+
+
+@pytest.mark.parametrize("wired", ["PE1", "elsewhere"])
+def test_the_pin_that_int_is_wired_to_is_found_among_all(monkeypatch, capsys, wired):
+    wire(int_pin=wired)
+    names = [port + str(n) for port in "ABCDE" for n in range(16)]
+    pins = {name: machine.Pin("P" + name) for name in names}
+    pins["B2"].on()  # always
+    monkeypatch.setattr(machine.Pin, "cpu", SimpleNamespace(**pins), raising=False)
+    (problem,) = doctor.report(board(int_pin="PB8", DRIVE="data_ready"))
+    found = wired == "PE1"
+    assert ("return Pin.cpu.E1 in data_ready_pin()" in problem) == found
+    assert ("samples are seen at Pin.cpu.E1\n" in capsys.readouterr().out) == found
 
 
 def test_a_bus_that_is_too_slow_for_the_fifo_is_found():

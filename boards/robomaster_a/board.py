@@ -63,7 +63,8 @@ def display(chunk):
 
 
 def data_ready_pin():
-    # Only for DRIVE = "data_ready". From several teams' headers, not from the vendor's.
+    # Only for DRIVE = "data_ready". From several teams' headers; an early project of the vendor's has PE1.
+    # `upright doctor` finds which one it is.
     return Pin("PB8", Pin.IN)
 
 

@@ -16,6 +16,9 @@ from upright_app.source import MICROTESLA, Source, conclude
 _MEASURE_MS = const(500)
 _BATCH = const(8)  # packets of the FIFO in one burst
 _STEPS = const(50)
+# Looks at all pins for the one that is INT, at this rate of samples
+_LOOKS = const(8)
+_LOOK_HZ = const(50)
 
 
 class _Counter:
@@ -166,7 +169,8 @@ def _report_line(board, source, problems):
     num, den = source.imu.sample_rate
     try:
         source.imu.configure_interrupt()
-        line = timing.DataReady(board.data_ready_pin(), counter.count, 0)
+        pin = board.data_ready_pin()
+        line = timing.DataReady(pin, counter.count, 0)
     except (OSError, ValueError, TypeError, AttributeError) as why:
         if needed:
             problems.append("INT line: %s" % why)
@@ -177,11 +181,40 @@ def _report_line(board, source, problems):
     good = abs(rate * den - num) <= 0.1 * num + 4 * den
     remark = "" if good or needed else ' (needed only with DRIVE = "data_ready")'
     print("INT line: %d pulses/s of %d/%d%s" % (rate, num, den, remark))
-    if needed and not good:
-        problems.append(
-            "INT line: %d pulses/s instead of %d/%d: is INT wired to the pin of data_ready_pin()?"
-            % (rate, num, den)
+    if good:
+        return
+    found = _pins_that_follow(source, pin)
+    if found:
+        print("INT line: the chip's samples are seen at", found)
+    if needed:
+        hint = (
+            "return %s in data_ready_pin()" % found
+            if found
+            else "is INT wired to the pin of data_ready_pin()?"
         )
+        problems.append("INT line: %d pulses/s instead of %d/%d: %s" % (rate, num, den, hint))
+
+
+def _pins_that_follow(source, pin):
+    """Which of the processor's pins rise with a sample and fall with read(), all the time: "Pin.cpu.E1", "" for none.
+
+    No pin's mode is changed: what is no input by itself is not found. On stm32 every pin is one after a reset.
+    """
+    cpu = getattr(type(pin), "cpu", None)
+    names = [name for name in dir(cpu) if name[0] != "_"] if cpu else []
+    imu = source.imu
+    source.configure(_LOOK_HZ)
+    imu.configure_interrupt(latch=True)
+    for _ in range(_LOOKS):
+        time.sleep_ms(1500 // _LOOK_HZ)
+        names = [name for name in names if getattr(cpu, name).value()]
+        for _ in range(3000 // _LOOK_HZ):
+            if imu.read() & 1:
+                break  # just now: there is time to look at them all
+            time.sleep_ms(1)
+        names = [name for name in names if not getattr(cpu, name).value()]
+    source.configure(source.config.RATE)
+    return " or ".join(["Pin.cpu." + name for name in names])
 
 
 def _report_fifo(source, needed, problems):
