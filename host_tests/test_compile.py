@@ -14,6 +14,10 @@ TARGETS = [
     for march in ("armv6m", "armv7emsp", "xtensawin", "rv32imc")
     if (version, march) != (runtimes.MPY_CROSS_VERSIONS[0], "rv32imc")  # it cannot, in all of 1.25
 ]
+# and those that no board of boards/ has, with the newest only
+TARGETS += [
+    (runtimes.MPY_CROSS_VERSIONS[-1], m) for m in ("armv7m", "armv7em", "armv7emdp", "xtensa")
+]
 
 
 def compiler(version):

@@ -326,7 +326,7 @@ def test_counts_cannot_go_straight_into_a_filter_of_the_board():
         replay.replay(as_trial(motions.render("static", seconds=1)), runtime="rp2040", direct=True)
 
 
-KERNELS = ("earth", "euler", "inertial", "mahony", "quaternion")
+KERNELS = sorted([*paths.PACKAGE.glob("*_kernels.py"), *paths.PACKAGE.glob("inertial_*.py")])
 
 
 def test_every_filter_has_cpython_s_bits_with_kernels_that_the_board_has_compiled_itself(
@@ -340,9 +340,8 @@ def test_every_filter_has_cpython_s_bits_with_kernels_that_the_board_has_compile
     motions.render("bursts", rate=(200, 1), seconds=1, seed=5).write(world)
     options.write_text('{"mag_every": 3}')
     files = emulated.project(application=False)
-    for kernel in KERNELS:
-        del files[f"lib/upright/{kernel}_kernels.mpy"]
-        source = paths.PACKAGE / f"{kernel}_kernels.py"
+    for source in KERNELS:
+        del files[f"lib/upright/{source.stem}.mpy"]
         files[f"lib/upright/{source.name}"] = source.read_bytes()
     cross = emulated.mpy_cross()
     script = Path(__file__).parent / "portable" / "filter_history.py"
@@ -351,8 +350,8 @@ def test_every_filter_has_cpython_s_bits_with_kernels_that_the_board_has_compile
     files |= {path.name: path.read_bytes() for path in (world, options)}
     board = rp2040.Board(image, files)
     board.boot()
-    for kernel in KERNELS:  # first: while the heap is whole
-        board.exec(f"from upright import {kernel}_kernels", 60)
+    for source in KERNELS:  # first: while the heap is whole
+        board.exec(f"from upright import {source.stem}", 60)
     for name in names:
         said = board.exec(
             f"import sys\nsys.argv[:] = ['', 'world.imu', 'out', {name!r}, 'options.json']\n"
