@@ -28,17 +28,22 @@ _MOST_LOST_US = const(2_000_000)  # an outage is counted in packets: what is old
 _SAME_PARTS = const(3)  # polls in a row that find the same part of a packet
 
 # The head of a buffer of samples: _HEAD bytes, then the first packet. In order: not 0 since a poll found nothing new,
-# see mpu_monitor.py; samples that differed from the one before, up to _VARIED; whether the newest is the same
-# (SAME_...); and three registers: INT_ENABLE, one that is not used, INT_STATUS.
+# see mpu_monitor.py; samples that differed from the one before, up to _VARIED; what is odd about the newest (ODD_...);
+# and three registers: INT_ENABLE, one that is not used, INT_STATUS.
 _HEAD = const(6)
 _QUIET = const(0)
 _CHANGES = const(1)
-_SAME = const(2)
+_ODD = const(2)
 _ENABLED = const(3)
 _STATUS = const(5)
 _VARIED = const(64)
-_SAME_SEEN = const(1)
-_SAME_TAKEN = const(2)
+_ODD_SAME = const(1)  # all words are as before
+_ODD_ZERO = const(2)  # a word has fallen to 0 at once
+_ODD_END = const(3)  # words have jumped, and the last byte is that of a bus that nobody drives
+_ODD_TAKEN = const(4)  # nothing: it is to be taken as it is
+# From one sample to the next no more is noise; and a sensor's filter that lets more through does not damp its noise,
+# so that its words do not stay at 0.
+_JUMP = const(255)
 
 
 def make_buffer(length):
@@ -54,38 +59,62 @@ def unpack(buffer: ptr8, at: int, counts: ptr16) -> int:
     """Big-endian accel, temperature, gyro at buffer[at..at+13] into counts; returns the flags.
 
     0: the sample is not an ordinary one, and counts are as they were. Either INT_STATUS before the first packet is
-    not exactly DATA_RDY, or INT_ENABLE lacks it. Or all words are the same as before: then buffer[_SAME] is _SAME_SEEN,
-    and with _SAME_TAKEN there the sample is taken all the same. Afterwards INT_STATUS is 0xff, which is not a status:
-    so a transfer that does not fill the buffer gives no sample.
+    not exactly DATA_RDY, or INT_ENABLE lacks it. Or buffer[_ODD] says what is odd about the words; with _ODD_TAKEN
+    there the sample is taken all the same. Afterwards INT_STATUS is 0xff, which is not a status: so a transfer that
+    does not fill the buffer gives no sample.
     """
     if at == _HEAD:
         if buffer[_STATUS] != 1 or buffer[_ENABLED] & 1 == 0:
             return 0
-    flags = 1
-    changed = 0
-    i = 0
-    while i < 6:
-        j = at + i + i
-        if i > 2:
-            j += 2  # past the temperature
+    odd = _ODD_SAME
+    i = 0  # of counts: 0 1 2, 9 (the temperature), 3 4 5
+    j = at
+    while i != 6:
         # signed by arithmetic: viper stores the low 16 bits, CPython's array wants the number
         word = ((buffer[j] << 8 | buffer[j + 1]) ^ 0x8000) - 0x8000
-        changed |= (counts[i] ^ word) & 0xFFFF
-        counts[i] = word
-        if word == 0x7FFF or word == -0x8000:
-            flags |= 4 if i < 3 else 8
+        step = word - (((counts[i] & 0xFFFF) ^ 0x8000) - 0x8000)
+        if step:
+            if odd == _ODD_SAME:
+                odd = 0
+            if step > _JUMP or step < 0 - _JUMP:
+                if word == 0:
+                    odd = _ODD_ZERO
+                elif odd == 0:
+                    odd = _ODD_END
+        j += 2
         i += 1
-    word = ((buffer[at + 6] << 8 | buffer[at + 7]) ^ 0x8000) - 0x8000
-    changed |= (counts[9] ^ word) & 0xFFFF
-    counts[9] = word
-    if changed:
+        if i == 3:
+            i = 9
+        elif i == 10:
+            i = 3
+    if odd == _ODD_END and buffer[j - 1] != 0xFF:
+        odd = 0
+    if odd:
+        if buffer[_ODD] != _ODD_TAKEN:
+            buffer[_ODD] = odd
+            return 0
+    if odd != _ODD_SAME:
         buffer[_QUIET] = 0
         if buffer[_CHANGES] < _VARIED:
             buffer[_CHANGES] += 1
-    elif buffer[_SAME] != _SAME_TAKEN:
-        buffer[_SAME] = _SAME_SEEN
-        return 0
-    buffer[_SAME] = 0
+    flags = 1
+    i = 0
+    j = at
+    while i != 6:
+        word = ((buffer[j] << 8 | buffer[j + 1]) ^ 0x8000) - 0x8000
+        counts[i] = word
+        if word == 0x7FFF or word == -0x8000:
+            if i < 3:
+                flags |= 4
+            elif i < 6:
+                flags |= 8
+        j += 2
+        i += 1
+        if i == 3:
+            i = 9
+        elif i == 10:
+            i = 3
+    buffer[_ODD] = 0
     buffer[_STATUS] = 0xFF
     counts[10] = flags
     return flags
@@ -224,7 +253,7 @@ class Fifo:
         self._at = at + self.packet
         self._pending -= 1
         if self._monitor.state:
-            return self._monitor.withhold()
+            return self._monitor.withhold(1)
         counts = self._counts
         flags = unpack(self.buffer, at, counts)
         if not flags:
@@ -238,8 +267,12 @@ class Fifo:
         return flags
 
     def _again(self, at):
-        """The packet is the same as the one before."""
-        return self._monitor.same(self.buffer) and unpack(self.buffer, at, self._counts)
+        """The packet is an odd one."""
+        if self.buffer[_ODD] == _ODD_END:  # the poll has read INT_STATUS behind it
+            self.buffer[_ODD] = _ODD_TAKEN
+        elif not self._monitor.accept(self.buffer):
+            return 0
+        return unpack(self.buffer, at, self._counts)
 
     def bytes_waiting(self):
         """FIFO_COUNT; -1 when the bus fails."""

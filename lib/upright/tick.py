@@ -414,7 +414,10 @@ class Tick:
         spent = self._spent()
         well = spent + spent <= self._period
         if well:
-            self._imu.health()
+            # a repair takes what it can of half a period
+            n = _REPAIRS
+            while self._imu.health() == _REPAIRING and n > 0 and 0 < self._spent() << 1 <= self._period:
+                n -= 1
         elif spent > self._period - (self._period >> 3):
             self._leave_out((spent + spent) // self._period)
         if self._black_box is not None:
