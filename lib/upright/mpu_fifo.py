@@ -25,6 +25,7 @@ _PACKET = const(14)  # accel x y z, temperature, gyro x y z
 _FLAGS = const(10)  # of counts
 _COUNT_MASK = const(0x3FFFFFFF)
 _MOST_LOST_US = const(2_000_000)  # an outage is counted in packets: what is older means nothing
+_LEAST_GAP = const(4)  # so many packets that did not come are no difference of clocks
 _SAME_PARTS = const(3)  # polls in a row that find the same part of a packet
 
 # The head of a buffer of samples: _HEAD bytes, then the first packet. In order: not 0 since a poll found nothing new,
@@ -160,10 +161,13 @@ class Fifo:
         self._pending = 0  # packets of the batch not yet delivered
         self._at = 0  # where the next one begins
         self._part = self._parts = 0  # of a packet that the last polls left, and how many of them
-        self.period_us = 0  # of the samples
-        # packets that were in the chip after the last poll that went well, and when; and the time of the present one
-        self._left = 0
+        self.period_us = 1  # of the samples
+        # The last poll that found packets: its time, the packets that it left in the chip, and how old the newest one
+        # was, at least and at most; and the time of the present poll.
         self._counted_us = self._now_us = 0
+        self._left = 0
+        self._age_least = self._age_most = 0
+        self._least_lost = _LEAST_GAP  # no fewer have been lost since: 1 after a restart
         self._table = table
         self._monitor = monitor
         self._counts = counts
@@ -199,9 +203,15 @@ class Fifo:
 
     def drop(self):
         """Drop the contents of the FIFO: it is restarted before the next packet."""
-        self._pending = self.level = self._left = 0
-        self._counted_us = ticks_us()  # set-up takes time that no filter has to make up for
+        self._pending = self.level = 0
+        self._count_from(ticks_us())  # set-up takes time that no filter has to make up for
         self._monitor.fifo_misaligned = 1
+
+    def _count_from(self, now):
+        self._counted_us = now
+        self._left = self._age_least = 0
+        self._age_most = self.period_us
+        self._least_lost = _LEAST_GAP
 
     # The tick: nothing below allocates, waits, raises or uses a float. The functions are small for the reason
     # given in mpu_monitor.py.
@@ -225,8 +235,6 @@ class Fifo:
         self.level = packets
         self._now_us = ticks_us()
         if not packets:
-            self._left = 0
-            self._counted_us = self._now_us
             self._monitor.no_sample(self.buffer)
             return 0
         # The last packet is complete. So if a part of a packet is left, either the chip is writing one, or the
@@ -296,9 +304,10 @@ class Fifo:
         self._monitor.fifo_misaligned = 1
         if self._fetch(n) and not fraction:
             self._monitor.fifo_misaligned = 0
+            if self.on:
+                self._count()
             self.level -= n
             self._left = self.level
-            self._counted_us = self._now_us
             self._at = _HEAD
             self.buffer[_STATUS] = _DATA_RDY  # for unpack()
             self._pending = n
@@ -307,6 +316,29 @@ class Fifo:
             self.overflows = (self.overflows + 1) & _COUNT_MASK
         self.restart()
         return 0
+
+    def _count(self):
+        """Compare the packets in the chip with the time since the last count: the others are lost.
+
+        The chip's clock goes on in an outage. So packets are counted exactly if the age of the newest one is known: it
+        is at least 0 and less than a period, and each count narrows that down until it tells nothing new. A restart
+        happens somewhere between two samples; only what is there afterwards tells how many it has cost.
+        """
+        passed = ticks_diff(self._now_us, self._counted_us)
+        period = self.period_us
+        came = self.level - self._left
+        if not 0 <= passed <= _MOST_LOST_US:
+            passed = _MOST_LOST_US
+        n = (passed + (self._age_least + self._age_most >> 1)) // period - came
+        if n >= self._least_lost:
+            self.lose(n)
+            came += n
+        self._least_lost = _LEAST_GAP
+        self._counted_us = self._now_us
+        slack = passed >> 6  # what the clocks may differ by
+        passed -= came * period
+        self._age_least = max(0, min(period, self._age_least + passed - slack))
+        self._age_most = min(period, max(self._age_least, self._age_most + passed + slack))
 
     def take_all(self):
         """The caller unpacks the batch itself."""
@@ -366,16 +398,12 @@ class Fifo:
             return False
         self._monitor.fifo_misaligned = 0
         self.resets = (self.resets + 1) & _COUNT_MASK
-        # Lost is what was in the FIFO at the last look, and what the chip has sampled since
-        self._now_us = ticks_us()
-        if self.on:
-            n = ticks_diff(self._now_us, self._counted_us)
-            if not 0 <= n <= _MOST_LOST_US:
-                n = _MOST_LOST_US
-            self.level = self._left + (n + (self.period_us >> 1)) // self.period_us
-        self.lose(self.level)
-        self.level = self._left = 0
-        self._counted_us = self._now_us
+        if self.on:  # _count() finds out how many packets that has cost
+            self._least_lost = 1
+        else:
+            self.lose(self.level)
+            self._count_from(ticks_us())
+        self.level = 0
         return True
 
 

@@ -34,8 +34,6 @@ _FIFO = {"DRIVE": "fifo"}
 _EDGES = {"DRIVE": "data_ready"}
 _NINE = {"board_name": "robomaster_a"}
 _HALF = SECOND // 2
-_FULL = "the filter takes a saturated axis for gravity"
-_LOST = "packets lost to an overflow are coasted through late, and their number is an estimate"
 
 
 def _one(name, on, fault, lasts, *value, text="", **more):
@@ -63,7 +61,7 @@ _MOMENTS = [
     ),
     _one("flip-sleep", "imu", "flip", None, 0x6B, 0x40, text="the chip sleeps"),
     _one("flip-clock", "imu", "flip", None, 0x1A, 0x07, text="a bit of CONFIG"),
-    _one("overflow", "imu", "overflow", None, board=_FIFO, text="the FIFO overflows", gap=_LOST),
+    _one("overflow", "imu", "overflow", None, board=_FIFO, text="the FIFO overflows"),
     _one("tick-raises", "bus", "raise", None, "ValueError", text="an exception in the tick"),
     _one("tick-no-heap", "bus", "raise", None, "MemoryError", text="an allocation in the tick"),
     _one("tick-ctrl-c", "bus", "raise", None, "KeyboardInterrupt", text="Ctrl-C in the tick"),
@@ -86,14 +84,13 @@ _TRANSIENTS = [
         0,
         0x7FFF,
         text="accelerometer x saturated",
-        gap=_FULL,
     ),
     _one("axis-stuck", "imu", "stuck_axis", _HALF, 5, 0, text="gyro z gives 0"),
     _one("sda-low", "bus", "low", SECOND, "sda", text="every transfer times out"),
     _one("scl-low", "bus", "low", SECOND, "scl"),
     _one("sda-low-stm32", "bus", "low", SECOND, "sda", options={"like": "stm32"}),
-    _one("sda-low-fifo", "bus", "low", SECOND, "sda", board=_FIFO, gap=_LOST),
-    _one("silent-fifo", "imu", "silent", SECOND, board=_FIFO, gap=_LOST),
+    _one("sda-low-fifo", "bus", "low", SECOND, "sda", board=_FIFO),
+    _one("silent-fifo", "imu", "silent", SECOND, board=_FIFO),
     _one("silent-edges", "imu", "silent", SECOND, board=_EDGES),
     _one("edges-lost", "board", "edges", SECOND, board=_EDGES, text="INT's wire is off"),
     _one("masked", "board", "masked", 50_000, text="interrupts are off for 50 ms"),
