@@ -417,7 +417,11 @@ class Tick:
         if well:
             # a repair takes what it can of half a period
             n = _REPAIRS
-            while self._imu.health() == _REPAIRING and n > 0 and 0 < self._spent() << 1 <= self._period:
+            while (
+                self._imu.health() == _REPAIRING
+                and n > 0
+                and 0 < self._spent() << 1 <= self._period
+            ):
                 n -= 1
         elif spent > self._period - (self._period >> 3):
             self._leave_out((spent + spent) // self._period)

@@ -18,7 +18,6 @@ class Case:
     options: dict = field(default_factory=dict)  # others of run_firmware.py
     flash: dict = field(default_factory=dict)  # {name: text} of the board's file system
     text: str = ""  # what it stands for
-    gap: str = ""  # why it may break a bound today
 
     def config(self):
         return self.options | {
@@ -55,7 +54,11 @@ _MOMENTS = [
         [[_T + 200, "imu", "brown_out", None]],
         text="the chip resets within a read",
     ),
+    _one("brown-out-fifo", "imu", "brown_out", None, board=_FIFO),
+    _one("brown-out-edges", "imu", "brown_out", None, board=_EDGES),
     _one("jam", "imu", "jam", None, text="it answers and samples no more"),
+    _one("jam-fifo", "imu", "jam", None, board=_FIFO),
+    _one("jam-edges", "imu", "jam", None, board=_EDGES),
     _one(
         "flip-range", "imu", "flip", None, 0x1B, 0x08, motion="static", text="a bit of GYRO_CONFIG"
     ),
@@ -93,6 +96,10 @@ _TRANSIENTS = [
     _one("silent-fifo", "imu", "silent", SECOND, board=_FIFO),
     _one("silent-edges", "imu", "silent", SECOND, board=_EDGES),
     _one("edges-lost", "board", "edges", SECOND, board=_EDGES, text="INT's wire is off"),
+    _one("unplugged-fifo", "imu", "unplugged", SECOND, board=_FIFO),
+    _one("unplugged-edges", "imu", "unplugged", SECOND, board=_EDGES),
+    _one("masked-fifo", "board", "masked", _HALF, board=_FIFO),
+    _one("masked-edges", "board", "masked", _HALF, board=_EDGES),
     _one("masked", "board", "masked", 50_000, text="interrupts are off for 50 ms"),
     _one("masked-long", "board", "masked", _HALF, text="for half a second"),
     _one("no-ticks", "board", "no_ticks", 50_000, text="the timer does not call"),
