@@ -28,9 +28,7 @@ _TURN = const(23)  # 3, Q31: correction that the next step takes up, earth frame
 _R = const(26)  # 9, Q15: rotation matrix; its rows are north, west, up in the body
 _FS = const(35)  # 3, Q9: specific force in the earth frame, counts, summed over the block
 _ONE_G = const(38)  # Q9: counts of 1 g
-_FULL_END = const(
-    39
-)  # 1 + 2 axis + sign of the accelerometer's axis that is at full scale, 0: none is
+_FULL_END = const(39)  # 1 + 2 axis + sign of the accelerometer at full scale, 0: none is
 _FULL_STEPS = const(40)  # steps that it has been there, no more than FULL_MOST + 1
 _FULL_MOST = const(41)  # for more steps no body is accelerated so much
 _FULL_SUM = const(42)  # 3, Q3: specific force of these steps, less 1 g, in the earth frame

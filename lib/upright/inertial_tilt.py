@@ -13,9 +13,7 @@ _PROBE = const(0)  # always -1, see fixmath.py
 _TURN = const(23)  # 3, Q31: correction that the next step takes up, earth frame, half angle
 _R = const(26)  # 9, Q15: rotation matrix; its rows are north, west, up in the body
 _FS = const(35)  # 3, Q9: specific force in the earth frame, counts, summed over the block
-_FULL_END = const(
-    39
-)  # 1 + 2 axis + sign of the accelerometer's axis that is at full scale, 0: none is
+_FULL_END = const(39)  # 1 + 2 axis + sign of the accelerometer at full scale, 0: none is
 _FULL_SUM = const(42)  # 3, Q3: specific force of these steps, less 1 g, in the earth frame
 _LATER = const(45)  # 3, Q3: of earlier ones, to be added to FS where there is room
 _BASE = const(49)  # 3, Q8: gyro bias that was set, counts

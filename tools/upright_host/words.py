@@ -94,7 +94,7 @@ TURN         3  Q31  correction that the next step takes up, earth frame, half a
 R            9  Q15  rotation matrix; its rows are north, west, up in the body
 FS           3  Q9   specific force in the earth frame, counts, summed over the block
 ONE_G        1  Q9   counts of 1 g
-FULL_END     1  -    1 + 2 axis + sign of the accelerometer's axis that is at full scale, 0: none is
+FULL_END     1  -    1 + 2 axis + sign of the accelerometer at full scale, 0: none is
 FULL_STEPS   1  -    steps that it has been there, no more than FULL_MOST + 1
 FULL_MOST    1  -    for more steps no body is accelerated so much
 FULL_SUM     3  Q3   specific force of these steps, less 1 g, in the earth frame
