@@ -1,8 +1,7 @@
 # The Digital Motion Processor of a simulated MPU: memory in banks, and packets from the world's motion.
 # Part of the chip models; portable (CPython, MicroPython). It runs no program: it compares its memory with images
-# that a test hands over, and does what these are known to do. Floats, as models may.
-
-import math
+# that a test hands over, and does what these are known to do. Integers, so that its packets are the same bits on ports
+# whose floats have 32 bits.
 
 from micropython import const
 
@@ -11,8 +10,9 @@ _PRGM_START_H = const(0x70)
 
 _DMP_EN = const(0x80)  # USER_CTRL
 _DIVIDER = const(0x216)  # D_0_22 of both images, 16 bits: a packet every 1 + this samples
-_TILT = 0.02  # of the tilt error that one step takes off where the world does not know the truth
-_UNIT = 1 << 30
+_TILT = 50  # one part in so many of the tilt error goes in a step where the world does not know the truth
+_Q = const(40)  # the attitude: 1.0 is 1 << _Q
+_PI = 3454217652358  # Q40
 
 # bytes of the image: program start, bytes of a packet
 LAYOUTS = {3062: (0x0400, 28), 1929: (0x0300, 42)}
@@ -167,11 +167,8 @@ class Dmp:
         for value in q:
             # nothing on a chip stands still to the last bit
             self._noise = (self._noise * 1103515245 + 12345) & 0x7FFFFFFF
-            _put(
-                packet,
-                int(value * _UNIT + (0.5 if value > 0 else -0.5)) + (self._noise >> 27) - 8,
-                4,
-            )
+            rounded = (value + (1 << _Q - 31)) >> _Q - 30  # Q30
+            _put(packet, rounded + (self._noise >> 27) - 8, 4)
         words = self.chip._words
         if self.layout == 3062:
             for i in (0, 1, 2, 4, 5, 6):
@@ -185,45 +182,44 @@ class Dmp:
         return packet
 
     def _truth(self, k):
-        """The world's attitude at row k as floats, with the yaw of the DMP's start taken off; or None."""
+        """The world's attitude at row k, with the yaw of the DMP's start taken off; or None."""
         truth = getattr(self.chip.world, "truth", None)
         truth = truth(k) if truth is not None else None
         if truth is None:
             return None
-        w, x, y, z = [v / _UNIT for v in truth]
+        w, x, y, z = [v << _Q - 30 for v in truth]
         if self._yaw is None:
-            half = math.atan2(2 * (x * y + w * z), w * w + x * x - y * y - z * z) / 2
-            self._yaw = math.cos(half), math.sin(half)
+            self._yaw = _half_turn(w * w + x * x - y * y - z * z, 2 * (x * y + w * z))
         c, s = self._yaw
-        return c * w + s * z, c * x + s * y, c * y - s * x, c * z - s * w
+        q = c * w + s * z, c * x + s * y, c * y - s * x, c * z - s * w
+        return [v >> _Q for v in q]
 
     def _integrate(self):
         """One step of the gyro's words, and a part of the way to level."""
         words = self.chip._words
         ax, ay, az = words[0], words[1], words[2]
-        length = math.sqrt(ax * ax + ay * ay + az * az)
+        length = _root(ax * ax + ay * ay + az * az << 16)  # Q8
         if self._q is None:
             # level at once: the shortest turn that brings the accelerometer up
-            q = (length + az, ay, -ax, 0.0) if length + az > 0 else (0.0, 1.0, 0.0, 0.0)
-            self._q = _unit(q)
+            up = length + (az << 8)
+            self._q = _unit((up, ay << 8, -(ax << 8), 0) if up > 0 else (0, 1, 0, 0))
             return
         w, x, y, z = self._q
         chip = self.chip
         us, samples = chip._period
         if chip._driven():
-            samples, us = chip.world.rate[0], chip.world.rate[1] * 1_000_000
+            samples, us = chip.world.rate[0], chip.world.rate[1] * 1000000
         # half the angle of a sample, rad; 82/5 LSB per deg/s
-        scale = math.pi / 360 * 5 / 82 * us / samples / 1e6
-        gx, gy, gz = words[4] * scale, words[5] * scale, words[6] * scale
+        num, den = _PI * 5 * us, 360 * 82 * 1000000 * samples
+        g = [words[i] * num // den for i in (4, 5, 6)]
         if length:
             ux, uy, uz = 2 * (x * z - w * y), 2 * (w * x + y * z), w * w - x * x - y * y + z * z
-            gain = _TILT / 2 / length
-            gx += (ay * uz - az * uy) * gain
-            gy += (az * ux - ax * uz) * gain
-            gz += (ax * uy - ay * ux) * gain
-        angle = math.sqrt(gx * gx + gy * gy + gz * gz)
-        c, s = math.cos(angle), math.sin(angle) / angle if angle else 1.0
-        gx, gy, gz = gx * s, gy * s, gz * s
+            error = ay * uz - az * uy, az * ux - ax * uz, ax * uy - ay * ux
+            # a unit of the accelerometer's counts is 1 << 8 of its length
+            g = [v + ((e >> _Q - 8) // (2 * _TILT * length)) for v, e in zip(g, error)]
+        square = g[0] * g[0] + g[1] * g[1] + g[2] * g[2] >> _Q
+        c, s = _series(square, 1), _series(square, 2)
+        gx, gy, gz = [v * s >> _Q for v in g]
         self._q = _unit(
             (
                 w * c - x * gx - y * gy - z * gz,
@@ -234,9 +230,42 @@ class Dmp:
         )
 
 
+def _series(square, n):
+    """cos(a) with n 1, sin(a) / a with n 2, of a's square; all Q40."""
+    total = term = 1 << _Q
+    while term:
+        term = -(term * square >> _Q) // (n * (n + 1))
+        total += term
+        n += 2
+    return total
+
+
+def _half_turn(x, y):
+    """(cos, sin) in Q40 of half the angle from the x axis to (x, y)."""
+    length = _root(x * x + y * y)
+    half = (length + x, y) if x >= 0 else (abs(y), length - x if y >= 0 else x - length)
+    size = _root(half[0] * half[0] + half[1] * half[1])
+    return [(v << _Q) // size for v in half] if size else (1 << _Q, 0)
+
+
 def _unit(q):
-    length = math.sqrt(sum([v * v for v in q]))
-    return tuple([v / length for v in q])
+    """Scaled to length 1, Q40."""
+    length = _root(sum([v * v for v in q]) << 2 * _Q)
+    return [(v << 2 * _Q) // length for v in q]
+
+
+def _root(value):
+    """The square root, rounded down (Newton's)."""
+    if value < 2:
+        return value
+    root = 1
+    while root * root < value:
+        root <<= 1
+    while True:
+        better = root + value // root >> 1
+        if better >= root:
+            return root
+        root = better
 
 
 def _put(packet, value, n):
