@@ -21,7 +21,7 @@ check: setup lint  ## what a change most likely breaks, in two minutes: two runt
 
 test: setup lint  ## everything, on every runtime that this machine can have
 	@$(PYTHON) tools/bootstrap.py --extras
-	@$(VENV)/upright runtimes cpython unix unix32 arm
+	@$(VENV)/upright runtimes cpython unix unix-1.26 unix32 arm
 	@$(PYTEST) --build-board $(PYTEST_ARGS)
 
 soak: setup  ## hours: the tests marked soak, with a hundred times the inputs and a day of simulated faults

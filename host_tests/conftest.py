@@ -21,7 +21,7 @@ import histories  # noqa: E402
 import micropython  # noqa: E402, F401  (the shim: it prepares `time` before anything of lib/ is imported)
 import motions  # noqa: E402
 import pytest  # noqa: E402
-from upright_host import oled, plotting, rp2040, runtimes, scoring, simulate, trials  # noqa: E402
+from upright_host import oled, plotting, qemu, rp2040, runtimes, scoring, simulate, trials  # noqa: E402
 
 PORTABLE = Path(__file__).parent / "portable"
 
@@ -65,7 +65,7 @@ def pytest_addoption(parser):
     parser.addoption(
         "--build-board",
         action="store_true",
-        help="build the emulated board's firmware, where there is none yet, beside the tests that do without it",
+        help="build the emulated boards' firmware, where there is none yet, beside the tests that do without it",
     )
     parser.addoption(
         "--soak", action="store_true", help="run tests marked soak at their full length"
@@ -84,28 +84,39 @@ def pytest_configure(config):
         for name in set(runtimes.LISTED) - set(chosen.split(",")):
             runtimes.leave_out(name, "left out by --runtimes")
     if not hasattr(config, "workerinput"):  # once, and the workers get the option as it is then
-        config.option.build_board = config.option.build_board and not rp2040.at_hand()
+        config.option.build_board = config.option.build_board and missing_boards()
         if config.option.build_board:
-            config.pluginmanager.register(BoardBuild())
+            config.pluginmanager.register(BoardBuild(config.option.build_board))
+    for name in qemu.RECIPES:  # without the option nobody waits minutes for one test
+        if not qemu.at_hand(name) and not config.option.build_board:
+            runtimes.leave_out(name, f"not built yet: `upright runtimes {name}`, or --build-board")
+
+
+def missing_boards():
+    """The emulated boards whose firmware would have to be built."""
+    missing = [name for name in qemu.RECIPES if not qemu.at_hand(name)]
+    return missing if rp2040.at_hand() else ["rp2040", *missing]
 
 
 class BoardBuild:
-    """The emulated board's firmware in the making; the fixture `image` waits for it."""
+    """The emulated boards' firmware in the making; the fixtures `image` and `runtime` wait for it."""
 
-    def __init__(self):
-        command = [Path(sys.executable).with_name("upright"), "runtimes", "rp2040"]
+    def __init__(self, names):
+        command = [Path(sys.executable).with_name("upright"), "runtimes", *names]
         self._process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         )
 
     def pytest_report_header(self):
-        return "the Pico's firmware is built meanwhile; its tests come last and wait for it"
+        return (
+            "the emulated boards' firmware is built meanwhile; its tests come last and wait for it"
+        )
 
     def pytest_terminal_summary(self, terminalreporter):
         if self._process.poll() is None:  # none of its tests was among these
             self._process.send_signal(signal.SIGINT)
-        terminalreporter.section("the Pico's firmware")
-        said = self._process.communicate()[0].splitlines()[-4:] or [
+        terminalreporter.section("the emulated boards' firmware")
+        said = self._process.communicate()[0].splitlines()[-6:] or [
             "given up: nothing waits for it"
         ]
         terminalreporter.write("\n".join(said) + "\n")
@@ -128,15 +139,25 @@ def pytest_generate_tests(metafunc):
 
 
 def pytest_collection_modifyitems(config, items):
-    """The emulated board's first, since they take the longest; last while its firmware is still being built.
+    """The emulated boards' first, since they take the longest; last while their firmware is still being built.
 
     What runs whole recorded trials is slow.
     """
-    last = config.option.build_board
-    items.sort(key=lambda item: ("test_rp2040" in item.nodeid) == last)
+    last = bool(config.option.build_board)
+    items.sort(key=lambda item: on_a_board(item) == last)
     for item in items:
         if "recorded" in item.fixturenames:
             item.add_marker(pytest.mark.slow)
+        if last and on_a_board(item):
+            item.add_marker(pytest.mark.timeout(1800))
+
+
+def on_a_board(item):
+    """Does a test need an emulated board's firmware?"""
+    values = item.callspec.params.values() if hasattr(item, "callspec") else ()
+    return "test_rp2040" in item.nodeid or any(
+        value in qemu.RECIPES for value in values if isinstance(value, str)
+    )
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -21,6 +21,7 @@ from upright.inertial import Inertial6
 from upright.ist8310 import IST8310
 from upright.mpu6050 import MPU6050
 from upright.mpu6500 import MPU6500
+from upright_host import qemu
 from world import StillWorld
 
 G = 4096
@@ -775,12 +776,18 @@ def test_the_settings_of_every_board_can_be_had(folder):
 
 def test_every_runtime_says_the_same(micropython_runtime, portable):
     """Integers to the last bit, floats as far as those of a board go; the tick's heap is locked meanwhile."""
+    single = micropython_runtime in qemu.RECIPES  # floats of 32 bits
     ours = portable("cpython", "ahrs_story.py").splitlines()
     theirs = portable(micropython_runtime, "ahrs_story.py").splitlines()
     assert len(theirs) == len(ours) == 5 * 8 + 2
     for line, wanted in zip(theirs, ours, strict=True):
         words, expected = line.split(), wanted.split()
         if words[1] in ("words", "tick") or words[0] in ("status", "waited"):
+            if single and words[0] in ("level", "turned", "zeroed") and words[1] == "words":
+                # level() turns the filter in floats: 24 bits of an attitude in Q29
+                q, wanted_q = ([int(word) for word in line[2:6]] for line in (words, expected))
+                assert q == pytest.approx(wanted_q, abs=256)
+                words[2:6] = expected[2:6]
             assert words == expected
         else:
             assert words[:2] == expected[:2]

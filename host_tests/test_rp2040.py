@@ -1009,31 +1009,3 @@ def test_an_image_is_taken_into_the_cache(image, version, tmp_path, monkeypatch)
     assert firmware.take(image) == version
     assert firmware.image().read_bytes() == image.read_bytes()
     assert tmp_path in firmware.image().parents
-
-
-def test_without_a_way_into_a_root_folder_the_reason_is_one_line(monkeypatch, tmp_path):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr(firmware.os, "geteuid", lambda: 1000)
-    monkeypatch.setattr(firmware, "_host_environment", lambda: {"PATH": str(tmp_path)})
-    with pytest.raises(runtimes.Unavailable) as why:
-        firmware._way_in(tmp_path / "root")
-    assert "root or user namespaces" in str(why.value)
-    assert "\n" not in str(why.value)
-
-
-def test_a_dead_mirror_is_said_and_leaves_nothing_behind(monkeypatch, tmp_path):
-    from upright_host import debian
-
-    if not debian.shutil.which("apt-get"):
-        pytest.skip("no apt-get here")
-    monkeypatch.setenv("UPRIGHT_CACHE", str(tmp_path))
-    monkeypatch.delenv(firmware.VARIABLE, raising=False)
-    monkeypatch.setattr(firmware, "_way_in", lambda root: [])
-    nowhere = tmp_path / "no-such-mirror"
-    monkeypatch.setattr(debian.Apt, "_mirror", staticmethod(lambda: f"file:{nowhere}"))
-    (tmp_path / "runtimes/.building-killed").mkdir(parents=True)  # what a killed run leaves
-    with pytest.raises(runtimes.Unavailable) as why:
-        firmware.image()
-    assert "apt-get" in str(why.value)
-    assert "\n" not in str(why.value)
-    assert list((tmp_path / "runtimes").iterdir()) == []

