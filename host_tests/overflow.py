@@ -212,3 +212,13 @@ def stand_still(rng, filter, row, at):
         s[at.LOW1 + i] = s[at.LOW2 + i] = row[i] << 12
     s[at.BLOCKS] = 1000
     s[at.STILL] = rng.choice((s[at.REST_AFTER], 0))
+
+
+def hold_back(rng, s, at):
+    """Any state that earth_kernels.believe_later() can come to. s: the filter's state, at: where its words stand."""
+    most = (s[at.FULL_MOST] + 1) * (56756 * 8 + (s[at.ONE_G] >> 6))
+    s[at.FULL_END], s[at.FULL_STEPS] = rng.randrange(7), rng.randint(0, s[at.FULL_MOST] + 1)
+    for first, size in ((at.FULL_SUM, most), (at.LATER, 0x1FFFFFFF)):
+        for i in range(3):
+            s[first + i] = rng.choice((-size, size, 0, rng.randint(-size, size)))
+    s[at.LATER_ANY] = 1

@@ -8,8 +8,10 @@ from array import array
 import motions
 import numpy as np
 import pytest
+import test_inertial
+import test_quaternion_kalman
 import translate
-from histories import ONE, SCALE, SCALES
+from histories import ONE, SCALE, SCALES, angles_between
 from samples import SOFTWARE, Scales, counts, run
 from scenes import PACES, all_axes, as_start, errors, pushes, scene
 from upright import earth_kernels, filters
@@ -21,6 +23,7 @@ from upright_host.simulate import best_runtime as quickest
 AT = words.places("inertial")
 STILL = 1  # of DECIDED, in both
 KINDS = {"inertial": Inertial9, "quaternion-kalman": QuaternionKalman9}
+TWINS = {"inertial": test_inertial, "quaternion-kalman": test_quaternion_kalman}
 LARGEST_BIAS = {"inertial": {"bias_limit_dps": 25}, "quaternion-kalman": {"bias_start": 10}}
 
 
@@ -206,6 +209,45 @@ def test_swings_cancel_before_they_count_as_tilt(history):
     rendered = scene(200, 30, accel=swing)
     inclination, _ = errors(history(rendered).q, rendered)
     assert inclination[10 * 200 :].max() < 1.2
+
+
+@pytest.mark.parametrize("range_g, rate", [(8, 200), (16, 1000), (4, 90)])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_an_axis_that_stays_at_full_scale_is_no_gravity(history, range_g, rate, axis):
+    rendered = scene(rate, 12, all_axes, range_g=range_g)
+    broken = scene(rate, 12, all_axes, range_g=range_g)
+    first, last = 8 * rate, 8 * rate + rate // 2
+    broken.counts[first:last, axis] = 32767
+    broken.counts[first:last, 10] |= 4
+    usual, _ = errors(history(rendered).q, rendered)
+    tilt, _ = errors(history(broken).q, rendered)
+    assert np.abs(tilt - usual)[first:].max() < 0.7
+
+
+@pytest.mark.parametrize("range_g, g, hz", [(2, 2, 5), (2, 2, 1.5), (8, 10, 3), (8, 15, 8)])
+def test_a_shake_beyond_full_scale_cancels_as_a_shake_within_it(history, kind, range_g, g, hz):
+    """Left out, what is cut off would tilt by up to 70 deg: the rest of the shake shows the opposite."""
+
+    def shake(t):
+        return np.outer(np.sin(2 * np.pi * hz * t) * (t > 5), np.array((0.5, 0.33, 0.83)) * g)
+
+    rendered = scene(200, 25, all_axes, shake, range_g=range_g)
+    assert (rendered.counts[:, 10] & 4 > 0).mean() > 0.1
+    tilt, _ = errors(history(rendered).q, rendered)
+    assert tilt[2000:].max() < (14 if hz == 8 else 3) * (1 if kind == "inertial" else 2)
+
+
+def test_with_an_axis_at_full_scale_the_kernel_agrees_with_the_twin(history, kind):
+    rng = np.random.default_rng(3)
+    rendered = scene(200, 10, all_axes, range_g=2)
+    for first in rng.integers(200, 1900, 25):
+        n = int(rng.choice([1, 5, 40, 110, 150]))  # 102 are 0.5 s
+        axis, word = int(rng.integers(3)), int(rng.choice([32767, -32768]))
+        rendered.counts[first : first + n, axis] = word
+        rendered.counts[first : first + n, 10] |= 4
+    done = history(rendered)
+    twin, _ = TWINS[kind].twin_history(rendered, done.decided)
+    assert angles_between(done.q, twin).max() < 0.3
 
 
 def test_a_turntable_from_power_on_is_taken_for_a_bias(history):

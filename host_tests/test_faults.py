@@ -27,10 +27,7 @@ def rig(tmp_path_factory):
 
 @pytest.mark.parametrize("name", PLANS)
 def test_every_plan_is_within_the_bounds(name, rig):
-    case = PLANS[name]
-    _, broken = rig.examine(case)
-    if broken and case.gap:
-        pytest.xfail(case.gap)
+    _, broken = rig.examine(PLANS[name])
     assert broken == []
 
 
@@ -207,10 +204,12 @@ def lasting(name, on, *values, most=SECOND):
     return st.tuples(st.just(on), st.just(name), st.integers(1000, most), *values)
 
 
-FAULT = st.one_of(
+BROKEN = [
     moment("nack", "imu", st.integers(1, 30), st.integers(0, 20)),
     moment("nack", "display", st.integers(1, 30), st.integers(0, 40)),
-    # a chip that falls silent in the middle of a burst is not among them: see What falls short in reliability.md
+    lasting("silent", "imu"),
+    lasting("unplugged", "imu"),
+    moment("brown_out", "imu"),
     lasting("silent", "display"),
     lasting("unplugged", "display"),
     moment("jam", "imu"),
@@ -222,33 +221,56 @@ FAULT = st.one_of(
     lasting("hang", "board"),
     lasting("disk_full", "board"),
     moment("flip", "imu", st.sampled_from([0x19, 0x1A, 0x37, 0x38, 0x6A, 0x6B]), st.just(0x40)),
-)
+]
+READ = [  # what is in the registers of the sample, not in the FIFO
+    lasting("zeros", "imu"),
+    lasting("frozen", "imu"),
+    lasting("stuck_axis", "imu", st.integers(0, 5), st.just(0)),
+    lasting("stuck_axis", "imu", st.integers(0, 2), st.sampled_from([0x7FFF, 0x8000])),
+]
+OF_DRIVE = {
+    "timer": READ,
+    "fifo": [moment("overflow", "imu")],
+    "data_ready": [*READ, lasting("edges", "board")],
+}
 
 
 @st.composite
-def plans(draw):
-    at, plan = 3 * SECOND, []
-    for fault in draw(st.lists(FAULT, min_size=1, max_size=4)):
+def plans(draw, drive):
+    at, plan = 5 * SECOND, []
+    for fault in draw(st.lists(st.one_of(BROKEN + OF_DRIVE[drive]), min_size=1, max_size=4)):
         at += draw(st.integers(0, 20000))
         plan.append([at, *fault])
         at += (fault[2] or 0) + QUIET
     return plan
 
 
-def bounds_hold(plan, drive, rig):
-    case = Case("random", plan, seconds=16, board={"DRIVE": drive})
+def bounds_hold(plan, drive, rig, filter=None):
+    case = Case("random", plan, seconds=18, board={"DRIVE": drive, "FILTER": filter})
     run, wrong = rig.examine(case)
     assert wrong == [], (drive, plan)
     assert not run.result["changes"] or not run.result["changes"][-1][2], "it is lost for ever"
 
 
-@pytest.mark.slow
-@hypothesis.settings(
-    max_examples=25, derandomize=True, suppress_health_check=list(hypothesis.HealthCheck)
+RANDOM = hypothesis.settings(
+    max_examples=20, derandomize=True, suppress_health_check=list(hypothesis.HealthCheck)
 )
-@hypothesis.given(plan=plans())
-def test_random_plans_are_within_the_bounds(plan, rig):
-    """What breaks is shrunk by hypothesis: put it into fault_plans.json."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("drive", OF_DRIVE)
+@RANDOM
+@hypothesis.given(data=st.data())
+def test_with_random_plans_driver_and_tick_are_within_the_bounds(drive, data, rig):
+    """What breaks is shrunk by hypothesis: put it into fault_plans.json. The classic filter learns no bias, so its yaw
+    is what driver and tick have made of it."""
+    bounds_hold(data.draw(plans(drive)), drive, rig, "mahony6")
+
+
+@pytest.mark.slow
+@RANDOM
+@hypothesis.given(plan=plans("timer"))
+def test_with_random_plans_the_default_filter_is_within_the_bounds(plan, rig):
     bounds_hold(plan, "timer", rig)
 
 
@@ -262,8 +284,3 @@ def test_the_page_has_every_plan_in_its_tables():
     cells = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
     named = re.findall(r"`([a-z0-9-]+)`", " ".join(cells))
     assert sorted(named) == sorted(PLANS)
-
-
-def test_the_page_tells_of_gaps_while_there_are_some():
-    page = (paths.ROOT / "docs" / "reliability.md").read_text()
-    assert ("## What falls short" in page) == any(case.gap for case in PLANS.values())

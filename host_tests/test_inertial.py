@@ -313,6 +313,7 @@ def unit(rng, n, size):
 def disturb(rng, filter):
     """Any state that the filter can come to, and the largest values foremost."""
     s = filter.state
+    overflow.hold_back(rng, s, AT)
 
     def put(name, values):
         for i, v in enumerate(values):

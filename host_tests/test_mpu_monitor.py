@@ -205,7 +205,7 @@ def test_the_gyros_start_and_four_times_the_filters_delay_are_waited_for(rig, dl
     begun = kernel.now()
     imu.configure(dlpf=dlpf)
     assert 0 <= kernel.now() - begun - without - 1000 * ms < 2000
-    # and after a reset of the chip as many samples
+    # and after a reset of the chip, too
     chip.brown_out(kernel.now())
     restored = None
     for _ in range(1000):

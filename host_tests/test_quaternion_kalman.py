@@ -397,6 +397,7 @@ def covariance(rng, most):
 def disturb(rng, filter):
     """Any state that the filter can come to, and the largest values foremost."""
     s = filter.state
+    overflow.hold_back(rng, s, AT)
     filter.set_bias(*(rng.choice((-(1 << 21), 1 << 21, 0)) for _ in range(3)))
 
     def put(at, n, size):

@@ -39,6 +39,34 @@ class EarthFloat:
         self.decided = self.decided | bit if value else self.decided & ~bit
         return bool(value)
 
+    full_end = full_steps = 0  # the end of which axis is full, and for how many steps
+    full_sum = later = (0.0, 0.0, 0.0)  # what they said, less 1 g; and earlier ones
+
+    def force(self, counts):
+        """The specific force in the earth frame in g. An axis at full scale is believed once it has come back."""
+        a = counts[0:3]
+        f = [(row[0] * a[0] + row[1] * a[1] + row[2] * a[2]) / self.lsb for row in self.R]
+        end = 0
+        if counts[10] & 4:
+            axis = max(range(3), key=lambda i: abs(a[i]))
+            end = 1 + 2 * axis + (a[axis] < 0)
+        most = self.hz * self.lsb // 32100
+        if end != self.full_end:
+            if self.full_steps <= most:
+                self.later = [v + u for v, u in zip(self.later, self.full_sum, strict=True)]
+            self.full_end, self.full_steps, self.full_sum = end, 0, (0.0, 0.0, 0.0)
+        if end:
+            if self.full_steps <= most:
+                self.full_steps += 1
+                self.full_sum = [
+                    u + v - g for u, v, g in zip(self.full_sum, f, (0, 0, 1), strict=True)
+                ]
+            f = [0.0, 0.0, 1.0]
+        room = [max(0.0, 32768 / self.lsb - abs(v)) for v in f]
+        taken = [clamp(v, r) for v, r in zip(self.later, room, strict=True)]
+        self.later = [v - u for v, u in zip(self.later, taken, strict=True)]
+        return [v + u for v, u in zip(f, taken, strict=True)]
+
     def gather(self, counts):
         """A fresh magnetometer sample into its sum in the earth frame."""
         m = counts[6:9]

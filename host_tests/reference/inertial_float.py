@@ -146,7 +146,7 @@ class InertialFloat(FieldFloat):
         self.pace = max(1, -(-PARTS // self.block))
         self.T, self.T2 = self.block / rate, 2 * self.block / rate
         self.gyro = math.radians(1 / gyro_scale)
-        self.lsb = accel_lsb_per_g
+        self.lsb, self.hz = accel_lsb_per_g, rate
         self.ramp = round(p["ramp_tilt"] * 256) / 256
         self.bias_start = math.radians(p["bias_start_dps"])
         self.unit = math.sqrt(2) * self.bias_start
@@ -220,6 +220,8 @@ class InertialFloat(FieldFloat):
     def _forget_sums(self):
         """What was summed is of another attitude; the next blocks are whole ones."""
         self.force_sum, self.mag_sum, self.mag_n = [0.0] * 3, [0.0] * 3, 0
+        self.full_end, self.full_steps = 0, 0
+        self.full_sum = self.later = (0.0, 0.0, 0.0)
         self.gyro_sum, self.pair_sum = [0] * 3, [0] * 3
         self.dx = [0.0] * 4
         self.part, self.phase = PARTS, 1
@@ -274,9 +276,9 @@ class InertialFloat(FieldFloat):
                 self.again = True
             self.full = 0
         R = self.R = rows(self.q)
-        a = counts[0:3]
+        force = self.force(counts)
         for i in range(3):
-            self.force_sum[i] += (R[i][0] * a[0] + R[i][1] * a[1] + R[i][2] * a[2]) / self.lsb
+            self.force_sum[i] += force[i]
             self.gyro_sum[i] += counts[3 + i]
         self.gather(counts)
         phase = self.phase

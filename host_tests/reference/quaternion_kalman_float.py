@@ -79,7 +79,7 @@ class QuaternionKalmanFloat(EarthFloat):
         self.block = block_of(rate, BLOCKS_HZ)
         self.T = T = self.block / rate
         self.dt = 1 / rate
-        self.lsb, self.gyro_scale = accel_lsb_per_g, gyro_scale
+        self.lsb, self.gyro_scale, self.hz = accel_lsb_per_g, gyro_scale, rate
         self.gyro = math.radians(1 / gyro_scale)  # rad/s of a count
         dps = self.dps = math.radians(1) * T  # rad a block
         self.bias_start = (p["bias_start"] * dps) ** 2
@@ -161,10 +161,10 @@ class QuaternionKalmanFloat(EarthFloat):
             return
         self.forced = decisions
         self.clip += bool(counts[10] & 8)
-        R = self.R = rows(self.q)
-        a = counts[0:3]
+        self.R = rows(self.q)
+        a, force = counts[0:3], self.force(counts)
         for i in range(3):
-            self.block_sum[i] += R[i][0] * a[0] + R[i][1] * a[1] + R[i][2] * a[2]
+            self.block_sum[i] += force[i] * self.lsb
             self.accel_sum[i] += a[i]
             self.gyro_sum[i] += counts[3 + i]
         self.gather(counts)

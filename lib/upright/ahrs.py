@@ -434,7 +434,8 @@ class AHRS:
             # only one in several samples has the magnetometer's: read them all
             ready = self.magnetometer is None or self.filter.AXES < 9 or flags & 2
             ready = ready or passed > _HEADING_MS
-            if flags & 1 and ready and self.filter.seed(self.counts):
+            # an axis at full scale is no gravity
+            if flags & 5 == 1 and ready and self.filter.seed(self.counts):
                 self._demand_time(read_us)
                 return
             time.sleep_us(100)

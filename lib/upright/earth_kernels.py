@@ -27,30 +27,37 @@ _OR = const(20)  # 3, Q46: its last bits, -32767..32767
 _TURN = const(23)  # 3, Q31: correction that the next step takes up, earth frame, half angle
 _R = const(26)  # 9, Q15: rotation matrix; its rows are north, west, up in the body
 _FS = const(35)  # 3, Q9: specific force in the earth frame, counts, summed over the block
-_BASE = const(38)  # 3, Q8: gyro bias that was set, counts
-_O_BASE = const(41)  # 3, Q31: O of BASE alone
-_OR_BASE = const(44)  # 3, Q46: its last bits
-_B = const(47)  # 3: learnt bias on top of BASE, in the filter's own unit
-_NINE = const(50)  # 1: use the magnetometer
-_BLOCK = const(51)  # log2 of the steps of a block
-_BLOCK_MASK = const(52)  # steps of a block less 1
-_PHASE = const(53)  # fresh steps of the block
-_MS = const(58)  # 3, Q9: magnetometer in the earth frame, counts, summed over the block
-_MN = const(61)  # samples in it
-_SINCE = const(62)  # blocks since the last with a magnetometer sample, no more than 16
-_J = const(63)  # blocks that the heading of this block stands for; 0: none
-_HEADING = const(64)  # Q28: heading error, rad
-_NOW = const(65)  # 2, Q13: horizontal and vertical field, counts
-_IN = const(67)  # 6, Q12: what LOW1 takes up: accelerometer, gyro less BASE, counts
-_LOW1 = const(73)  # 6, Q12: first low-pass of it
-_LOW2 = const(79)  # 6, Q12: second
-_AWAY = const(85)  # 2, Q6: squared distance from LOW2 of accelerometer and gyro, counts**2
-_BLOCKS = const(87)  # of the low-passes' start
-_STILL = const(88)  # blocks without motion, no more than REST_AFTER
-_REST_AFTER = const(89)  # blocks
-_REST_K = const(90)  # Q15: gain of the low-passes
-_REST_GYRO = const(91)  # Q6: at rest AWAY is less: counts**2
-_REST_ACCEL = const(92)  # Q6: the same of the accelerometer
+_ONE_G = const(38)  # Q9: counts of 1 g
+_FULL_END = const(39)  # 1 + 2 axis + sign of the accelerometer at full scale, 0: none is
+_FULL_STEPS = const(40)  # steps that it has been there, no more than FULL_MOST + 1
+_FULL_MOST = const(41)  # for more steps no body is accelerated so much
+_FULL_SUM = const(42)  # 3, Q3: specific force of these steps, less 1 g, in the earth frame
+_LATER = const(45)  # 3, Q3: of earlier ones, to be added to FS where there is room
+_LATER_ANY = const(48)  # not 0: some of it is left
+_BASE = const(49)  # 3, Q8: gyro bias that was set, counts
+_O_BASE = const(52)  # 3, Q31: O of BASE alone
+_OR_BASE = const(55)  # 3, Q46: its last bits
+_B = const(58)  # 3: learnt bias on top of BASE, in the filter's own unit
+_NINE = const(61)  # 1: use the magnetometer
+_BLOCK = const(62)  # log2 of the steps of a block
+_BLOCK_MASK = const(63)  # steps of a block less 1
+_PHASE = const(64)  # fresh steps of the block
+_MS = const(69)  # 3, Q9: magnetometer in the earth frame, counts, summed over the block
+_MN = const(72)  # samples in it
+_SINCE = const(73)  # blocks since the last with a magnetometer sample, no more than 16
+_J = const(74)  # blocks that the heading of this block stands for; 0: none
+_HEADING = const(75)  # Q28: heading error, rad
+_NOW = const(76)  # 2, Q13: horizontal and vertical field, counts
+_IN = const(78)  # 6, Q12: what LOW1 takes up: accelerometer, gyro less BASE, counts
+_LOW1 = const(84)  # 6, Q12: first low-pass of it
+_LOW2 = const(90)  # 6, Q12: second
+_AWAY = const(96)  # 2, Q6: squared distance from LOW2 of accelerometer and gyro, counts**2
+_BLOCKS = const(98)  # of the low-passes' start
+_STILL = const(99)  # blocks without motion, no more than REST_AFTER
+_REST_AFTER = const(100)  # blocks
+_REST_K = const(101)  # Q15: gain of the low-passes
+_REST_GYRO = const(102)  # Q6: at rest AWAY is less: counts**2
+_REST_ACCEL = const(103)  # Q6: the same of the accelerometer
 # -- end of the words
 
 
@@ -68,11 +75,74 @@ _ATAN = array("i", [
 
 # ------------------------------------------------------------------------------------------ every step
 @micropython.viper
+def believe_later(s: ptr32, north: int, west: int, up: int, end: int):
+    """The specific force of a step, Q9, with an axis at full scale (`end`), or after such steps, into FS.
+
+    A shake or a blow may reach full scale. To leave that out would tilt: the rest of the motion shows the opposite. But
+    an axis that stays there is broken. So 1 g upward takes the place of these steps, and what they said is
+    added when the axis has come back in time; no step has more than full scale.
+    """
+    k = 0
+    if s[_PROBE] > 0:
+        k = 32
+    n = s[_FULL_STEPS]
+    if end != s[_FULL_END]:
+        # the one before is over
+        i = 0
+        while i < 3:
+            if n <= s[_FULL_MOST]:
+                h = (s[_LATER + i] << k >> k) + (s[_FULL_SUM + i] << k >> k)
+                if h > 0x1FFFFFFF:
+                    h = 0x1FFFFFFF
+                elif h < -0x1FFFFFFF:
+                    h = -0x1FFFFFFF
+                s[_LATER + i] = h
+            s[_FULL_SUM + i] = 0
+            i += 1
+        s[_FULL_END] = end
+        n = 0
+        s[_FULL_STEPS] = 0
+    if end:
+        if n <= s[_FULL_MOST]:
+            s[_FULL_STEPS] = n + 1
+            s[_FULL_SUM] = s[_FULL_SUM] + (north >> 6)
+            s[_FULL_SUM + 1] = s[_FULL_SUM + 1] + (west >> 6)
+            s[_FULL_SUM + 2] = s[_FULL_SUM + 2] + (up - s[_ONE_G] >> 6)
+        north = 0
+        west = 0
+        up = s[_ONE_G]
+    left = 0
+    i = 0
+    v = north
+    while i < 3:
+        room = v >> 6
+        if room < 0:
+            room = 0 - room
+        room = 0x40000 - room
+        if room < 0:
+            room = 0
+        h = s[_LATER + i] << k >> k
+        r = h
+        if r > room:
+            r = room
+        elif r < 0 - room:
+            r = 0 - room
+        s[_LATER + i] = h - r
+        left |= h - r
+        s[_FS + i] = s[_FS + i] + v + (r << 6)
+        i += 1
+        v = west
+        if i == 2:
+            v = up
+    s[_LATER_ANY] = left
+
+
+@micropython.viper
 def to_earth(s: ptr32, counts: ptr16):
     """R of Q; the specific force in the earth frame goes into the sum FS, a fresh magnetometer sample into MS, MN.
 
-    The accelerometer is used as measured, neither normalised nor left out at full scale, so that swings cancel. A
-    magnetometer sample is left out when all of it is zero or an axis is at full scale.
+    The accelerometer is used as measured, neither normalised nor left out at full scale, so that swings cancel; but
+    see believe_later(). A magnetometer sample is left out when all of it is zero or an axis is at full scale.
     """
     k = 0
     if s[_PROBE] > 0:
@@ -91,7 +161,7 @@ def to_earth(s: ptr32, counts: ptr16):
     s[_R] = m
     s[_R + 1] = n
     s[_R + 2] = o
-    s[_FS] = s[_FS] + (m * x + n * y + o * z + 32 >> 6)
+    north = m * x + n * y + o * z + 32 >> 6
     # west
     m = (b * c + a * d + 8192) >> 14
     n = 32768 - ((b * b + d * d + 8192) >> 14)
@@ -99,7 +169,7 @@ def to_earth(s: ptr32, counts: ptr16):
     s[_R + 3] = m
     s[_R + 4] = n
     s[_R + 5] = o
-    s[_FS + 1] = s[_FS + 1] + (m * x + n * y + o * z + 32 >> 6)
+    west = m * x + n * y + o * z + 32 >> 6
     # up
     m = (b * d - a * c + 8192) >> 14
     n = (c * d + a * b + 8192) >> 14
@@ -107,7 +177,31 @@ def to_earth(s: ptr32, counts: ptr16):
     s[_R + 6] = m
     s[_R + 7] = n
     s[_R + 8] = o
-    s[_FS + 2] = s[_FS + 2] + (m * x + n * y + o * z + 32 >> 6)
+    up = m * x + n * y + o * z + 32 >> 6
+    end = 0
+    if counts[10] & 4:
+        # the axis that is farthest out
+        end = 1
+        a = x
+        if x < 0:
+            end = 2
+            a = 0 - x
+        if y > a or y < 0 - a:
+            end = 3
+            a = y
+            if y < 0:
+                end = 4
+                a = 0 - y
+        if z > a:
+            end = 5
+        elif z < 0 - a:
+            end = 6
+    if end | s[_FULL_END] | s[_LATER_ANY]:
+        believe_later(s, north, west, up, end)
+    else:
+        s[_FS] = s[_FS] + north
+        s[_FS + 1] = s[_FS + 1] + west
+        s[_FS + 2] = s[_FS + 2] + up
     if counts[10] & 2 == 0 or s[_NINE] == 0 or s[_MN] > 63:  # MS holds 64
         return
     # MS += R mag
@@ -300,6 +394,9 @@ class EarthFilter(Attitude):
                     per,
                 )
             )
+        s[_ONE_G] = accel_lsb_per_g << 9
+        # until 10 m/s are reached from rest
+        s[_FULL_MOST] = num * accel_lsb_per_g // (32100 * den)
         if self.gyro_counts(p["rest_gyro_dps"], 1) > 2000:
             raise ValueError("gyro_scale is %d/%d, too fine for rest_gyro_dps" % self.gyro_scale)
         t = den << shift
@@ -354,7 +451,8 @@ class EarthFilter(Attitude):
             s[_WR + i] = 16384
             s[_TURN + i] = 0
             s[_MS + i] = 0
-        s[_MN] = s[_SINCE] = s[_J] = 0
+            s[_LATER + i] = s[_FULL_SUM + i] = 0
+        s[_MN] = s[_SINCE] = s[_J] = s[_FULL_END] = s[_FULL_STEPS] = s[_LATER_ANY] = 0
 
     def set_bias(self, x, y, z, known_s=0):
         """Set the gyro's bias, ints in 1/256 of a gyro count; what the filter learns afterwards is added to it.

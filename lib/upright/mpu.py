@@ -44,11 +44,10 @@ _EXT_BYTES = const(24)  # EXT_SENS_DATA
 _PACKET = const(14)  # accel x y z, temperature, gyro x y z
 # The head of a buffer, see mpu_fifo.py
 _HEAD = const(6)
-_SAME = const(2)
+_ODD = const(2)
 _ENABLED = const(3)
 _STATUS = const(5)
-_SAME_SEEN = const(1)
-_SAME_TAKEN = const(2)
+_ODD_TAKEN = const(4)
 
 # Until the zero-rate output has settled: PS 6.1; PS-MPU-6500A rev 1.3, table 1
 _GYRO_START_MS = const(30)
@@ -163,14 +162,14 @@ class Mpu(Counters):
 
     def _unusual(self, raw):
         """What is not an ordinary sample: flags if it is one all the same, else 0."""
-        if raw[_SAME] != _SAME_SEEN:
+        if not raw[_ODD]:
             if not self._is_sample(raw):
                 return 0
             flags = unpack(raw, _HEAD, self.counts)
             if flags:
                 return flags
         raw[_STATUS] = 0xFF
-        if not self.monitor.same(raw):
+        if not self.monitor.accept(raw):
             return 0
         raw[_STATUS] = _DATA_RDY
         return unpack(raw, _HEAD, self.counts)
@@ -184,7 +183,7 @@ class Mpu(Counters):
         except OSError:
             return self.monitor.fault()
         if self._is_sample(self._raw):
-            self.monitor.withhold()
+            self.monitor.withhold(0)
         return self.counts[_FLAGS]
 
     def _is_sample(self, raw):
@@ -345,8 +344,8 @@ class Mpu(Counters):
         self.monitor.start(
             self.port.after_reset,
             interface,
-            1 + self.settle_ms * num // (1000 * den),
-            1000 * den // num,
+            self.settle_ms,
+            self.sample_rate,
         )
         self.fifo.period_us = (2_000_000 * den + num) // (2 * num)
         self._configured = True
@@ -637,10 +636,10 @@ class Mpu(Counters):
             raw[_STATUS] = _DATA_RDY
             if self.monitor.constant:
                 self._tell("(its samples never vary)")
-        raw[_SAME] = _SAME_TAKEN
+        raw[_ODD] = _ODD_TAKEN
         if unpack(raw, _HEAD, self.counts):
             self.monitor.not_fresh()
-        raw[_SAME] = 0
+        raw[_ODD] = 0
         self.monitor.heard()
 
     def _varies(self, period_ms):
@@ -676,10 +675,10 @@ class Mpu(Counters):
         # a sample that was ready meanwhile: accel() has it until there is a newer one
         raw = self._raw
         self.registers.read_registers(self._first, self._burst)
-        raw[_SAME] = _SAME_TAKEN
+        raw[_ODD] = _ODD_TAKEN
         if unpack(raw, _HEAD, self.counts):
             self.monitor.not_fresh()
-        raw[_SAME] = 0
+        raw[_ODD] = 0
         self.monitor.heard()
 
     def _need_configured(self):

@@ -43,9 +43,11 @@ _LOOKED = const(2)  # the last call did
 # The head of a buffer, see mpu_fifo.py, and values of its first byte
 _QUIET = const(0)
 _CHANGES = const(1)
-_SAME = const(2)
+_ODD = const(2)
 _VARIED = const(64)
-_SAME_TAKEN = const(2)
+_ODD_SAME = const(1)
+_ODD_END = const(3)
+_ODD_TAKEN = const(4)
 _NOTHING_NEW = const(1)
 _FROZEN = const(2)
 
@@ -54,6 +56,9 @@ _FULL_SCALE_FLAGS = const(0x0C)
 _COUNT_MASK = const(0x3FFFFFFF)  # counters wrap within a small int of 32-bit ports
 _TRIES = const(3)  # failed repairs in a row before a full reset
 _PATIENCE_MS = const(250)  # and ten samples: after so long without a sample the chip is reset
+_STILL_MS = const(
+    50
+)  # and ten samples: the same sample for longer is none (to leave it out harms little)
 
 
 class Monitor:
@@ -63,8 +68,8 @@ class Monitor:
     are correct but no samples come, or if three repairs in a row fail, the chip gets a full RESET first. The first row
     of the table is PWR_MGMT_1, the last USER_CTRL.
 
-    errors, frozen (samples that were the same for too long), resets (of the chip by itself) and full_resets (by this)
-    are counters.
+    errors, impossible (samples that were the same for too long, or in which a word fell to 0), resets (of the chip by
+    itself) and full_resets (by this) are counters.
 
     A transfer may leave its buffer as it was and raise nothing: the rp2 port does so when the chip refuses the number
     of the register (machine_i2c.c: a short write in readfrom_mem_into is no error there). So a buffer first gets what
@@ -73,7 +78,7 @@ class Monitor:
 
     def __init__(self, registers, table, counts):
         self.errors = 0
-        self.frozen = 0
+        self.impossible = 0
         self.resets = 0
         self.full_resets = 0
         self.fifo_misaligned = (
@@ -88,20 +93,23 @@ class Monitor:
         self._table = table
         self._counts = counts
         self._byte = bytearray(1)
-        self.start(b"", 0, 0, 0)
+        self.start(b"", 0, 0, (1000, 1))
         # MicroPython looks for a method among the attributes of the instance first. A table of attributes that is
         # (nearly) full is searched from end to end: 1500 instructions a call. So the methods that every tick calls
         # are stored as attributes.
         self.health = self.health
         self._compare = self._compare
 
-    def start(self, after_reset, interface, settle_samples, period_ms):
+    def start(self, after_reset, interface, settle_ms, rate):
         """Start to check a chip that has just been configured.
 
-        after_reset     pairs (register, value) that a full reset ends with
-        interface       the bits of USER_CTRL that the bus needs
-        settle_samples  samples to withhold after a repair
+        after_reset  pairs (register, value) that a full reset ends with
+        interface    the bits of USER_CTRL that the bus needs
+        settle_ms    how long to withhold samples after a repair
+        rate         of the samples, (num, den) Hz
         """
+        num, den = rate
+        period_ms = 1000 * den // num
         steps = [(register, 0) for register in _SLV_CTRL] + [(_WAIT, _MASTER_MS)]
         self._without_master = 2 * len(steps)
         steps += [(_USER_CTRL, interface), (_PWR_MGMT_1, _DEVICE_RESET), (_WAIT, _RESET_MS)]
@@ -110,11 +118,16 @@ class Monitor:
             steps.append((_WAIT, _RESET_MS))
         self._reset_steps = bytes([byte for step in steps for byte in step])
         self._interface = interface
-        self._settle_samples = settle_samples
+        self.settle_ms = (
+            settle_ms + period_ms
+        )  # after a repair; the newest sample may be a period old
+        self._settle_samples = 1 + settle_ms * num // (1000 * den)
         self._patience_ms = _PATIENCE_MS + 10 * period_ms
+        self._still_ms = _STILL_MS + 10 * period_ms
         self.state = WATCH
         self._at = 0  # the row, or the step of the reset, that is next; -1 in RESTORE: the FIFO is switched off
-        self._left = 0  # samples still to be withheld
+        self._left = 0  # samples still to be withheld, if they come through the FIFO
+        self._restored = 0  # when the registers were written back
         self._tries = 0
         self._doubt = 0
         self._silent = 0  # 1: no sample for longer than the time limit
@@ -254,6 +267,7 @@ class Monitor:
             self._at = 0
             self.state = VERIFY
             self._left = self._settle_samples
+            self._restored = time.ticks_ms()
             if self._table.last() & _FIFO_ENABLE:
                 self.fifo_misaligned = 1
             self.heard()
@@ -316,42 +330,56 @@ class Monitor:
             self._silent = 0 if self._table.values[0] & _SLEEP else 1
         return self.not_fresh()
 
-    def same(self, quiet):
-        """A new sample with the same words as the last one: may it be used? quiet: the head of its buffer.
+    def accept(self, quiet):
+        """A new sample is odd: may it be used? quiet: the head of its buffer.
 
-        Two such samples are a rare chance. A chip that hangs gives them for ever, and is reset. A simulator may, too:
-        what has never varied is not expected to.
+        The same words twice are a rare chance. A chip that hangs gives them for ever, and is reset. A word that falls
+        from far off to exactly 0 is a rare chance, too; one that then stays there measures nothing. A simulator may do
+        both: what has never varied is not expected to. If the last byte is that of a bus which nobody drives, the chip
+        is asked whether it is still there.
         """
-        if self.constant or quiet[_CHANGES] < _VARIED:
+        odd = quiet[_ODD]
+        quiet[_ODD] = 0
+        if odd == _ODD_END:
+            self._byte[0] = ~self.who_am_i & 0xFF
+            if not self._ask(_WHO_AM_I) or self._byte[0] != self.who_am_i:
+                self.fault()
+                return False
+        elif self.constant or quiet[_CHANGES] < _VARIED:
             quiet[_QUIET] = 0
-        elif not quiet[_QUIET]:
+        elif odd != _ODD_SAME or self._frozen(quiet):
+            self.impossible = (self.impossible + 1) & _COUNT_MASK
+            self.no_sample(quiet)
+            return False
+        quiet[_ODD] = _ODD_TAKEN
+        return True
+
+    def _frozen(self, quiet):
+        """Has the sample been the same for too long?"""
+        if not quiet[_QUIET]:
             quiet[_QUIET] = _NOTHING_NEW
             self.heard()
-        elif (
-            quiet[_QUIET] == _FROZEN
-            or time.ticks_diff(time.ticks_ms(), self._since) > self._patience_ms
-        ):
-            if time.ticks_diff(time.ticks_ms(), self._since) > self._patience_ms:
-                self._silent = 1
+        elif time.ticks_diff(time.ticks_ms(), self._since) > self._still_ms:
             quiet[_QUIET] = _FROZEN
-            quiet[_SAME] = 0
-            self._doubt |= _DOUBT
-            self.frozen = (self.frozen + 1) & _COUNT_MASK
-            self.not_fresh()
-            return False
-        quiet[_SAME] = _SAME_TAKEN
-        return True
+        return quiet[_QUIET] == _FROZEN
 
     def heard(self):
         """Restart the time limit for the next sample."""
         self._silent = 0
         self._since = time.ticks_ms()
 
-    def withhold(self):
-        """A sample that came before the gyro has settled: count it, and clear its fresh bits."""
+    def withhold(self, queued):
+        """A sample that may be from before the gyro has settled: clear its fresh bits.
+
+        queued: it comes from the FIFO. Such samples are counted, for they may be read late; but of those that the chip
+        takes between two reads only one is seen.
+        """
         self.heard()
         if self._left:
-            self._left -= 1
+            if queued:
+                self._left -= 1
+            elif time.ticks_diff(time.ticks_ms(), self._restored) >= self.settle_ms:
+                self._left = 0
             if not self._left and self.state == SETTLE:
                 self.state = WATCH
         return self.not_fresh()

@@ -17,9 +17,9 @@ _INT_STATUS = 0x3A
 _PWR_MGMT_1 = 0x6B
 # The head of a buffer, see mpu_fifo.py
 _HEAD = 6
-_SAME = 2
+_ODD = 2
 _STATUS = 5
-_SAME_TAKEN = 2
+_ODD_TAKEN = 4
 _ALL_AXES = 0xE0  # XG_ST, YG_ST, ZG_ST and XA_ST, YA_ST, ZA_ST
 _PRECISION = 16  # trims are in LSB times 2**16
 
@@ -131,7 +131,7 @@ def _sums(imu, actuators, ranges, samples):
         else:
             raise imu.error_class("no sample in 20 ms during the self-test")
         raw[_STATUS] = 1  # not what else INT_STATUS said
-        raw[_SAME] = _SAME_TAKEN
+        raw[_ODD] = _ODD_TAKEN
         unpack(raw, _HEAD, counts)
         for i in range(6):
             sums[i] += counts[i]

@@ -265,6 +265,10 @@ class Tick:
             well = n > 0 or ticks_diff(ticks_us(), began) < _TIME_OUT_US
             if n == 0:
                 self._no_packet(well)
+            lost = imu.fifo_lost
+            if lost != self._lost:
+                self._owed += (lost - self._lost) & _WRAP
+                self._lost = lost
             if self._owed > 0:
                 self._make_up()
             while n > 0:
@@ -285,9 +289,6 @@ class Tick:
             self._look_after()
         if self._black_box is not None:
             self._black_box.look()
-        lost = self._imu.fifo_lost
-        self._owed += (lost - self._lost) & _WRAP
-        self._lost = lost
 
     @micropython.native
     def _on_guard(self, source):
@@ -414,7 +415,14 @@ class Tick:
         spent = self._spent()
         well = spent + spent <= self._period
         if well:
-            self._imu.health()
+            # a repair takes what it can of half a period
+            n = _REPAIRS
+            while (
+                self._imu.health() == _REPAIRING
+                and n > 0
+                and 0 < self._spent() << 1 <= self._period
+            ):
+                n -= 1
         elif spent > self._period - (self._period >> 3):
             self._leave_out((spent + spent) // self._period)
         if self._black_box is not None:

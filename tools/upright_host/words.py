@@ -93,6 +93,13 @@ OR           3  Q46  its last bits, -32767..32767
 TURN         3  Q31  correction that the next step takes up, earth frame, half angle
 R            9  Q15  rotation matrix; its rows are north, west, up in the body
 FS           3  Q9   specific force in the earth frame, counts, summed over the block
+ONE_G        1  Q9   counts of 1 g
+FULL_END     1  -    1 + 2 axis + sign of the accelerometer at full scale, 0: none is
+FULL_STEPS   1  -    steps that it has been there, no more than FULL_MOST + 1
+FULL_MOST    1  -    for more steps no body is accelerated so much
+FULL_SUM     3  Q3   specific force of these steps, less 1 g, in the earth frame
+LATER        3  Q3   of earlier ones, to be added to FS where there is room
+LATER_ANY    1  -    not 0: some of it is left
 BASE         3  Q8   gyro bias that was set, counts
 O_BASE       3  Q31  O of BASE alone
 OR_BASE      3  Q46  its last bits
