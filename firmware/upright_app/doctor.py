@@ -198,10 +198,11 @@ def _report_line(board, source, problems):
 def _pins_that_follow(source, pin):
     """Which of the processor's pins rise with a sample and fall with read(), all the time: "Pin.cpu.E1", "" for none.
 
-    No pin's mode is changed: what is no input by itself is not found. On stm32 every pin is one after a reset.
+    No pin's mode is changed: what is no input by itself is not found. On stm32 every pin is one after a reset. EXT_...:
+    those of a Pico W's radio chip.
     """
     cpu = getattr(type(pin), "cpu", None)
-    names = [name for name in dir(cpu) if name[0] != "_"] if cpu else []
+    names = [name for name in dir(cpu) if name[0] != "_" and name[:3] != "EXT"] if cpu else []
     imu = source.imu
     source.configure(_LOOK_HZ)
     imu.configure_interrupt(latch=True)
