@@ -614,10 +614,10 @@ application.run()
 """
 
 
-def test_the_watchdog_lets_a_healthy_run_be_and_resets_a_board_whose_step_hangs(image, version):
+def test_the_watchdog_lets_a_healthy_run_be_and_resets_a_board_whose_step_hangs(image):
     """After 1.2 s, more than the time-out, the control loop never returns to the program."""
     settings = "WATCHDOG_MS = 1000\nMEASURE_BIAS = False\nFILTER = 'mahony6'\n"
-    files = emulated.project(version, "pico", settings)
+    files = emulated.project("pico", settings)
     files["main.py"] = HANGS
     board = rp2040.Board(image, files)
     world = StillWorld((0, 0, 4096))
