@@ -48,7 +48,6 @@ def save(figure, path) -> None:
 ANGLES = ("roll", "pitch", "yaw")
 SMOOTHED_S = 1.0  # errors are drawn as the root mean square over so long
 _POINTS = 3000  # a line; the picture is not wider
-_TURNS = 3  # an angle that runs on for longer stays within +-180 deg
 _LEAST_DEG = 0.02  # the errors' scale begins here
 
 
@@ -100,18 +99,15 @@ def attitudes(trial, rows, path) -> None:
     step = max(1, len(t) // _POINTS)
     looks = _looks(rows)
 
-    reference = euler(trial.q_true()[: len(t)] if truth else turned[0])
+    if truth:
+        reference = np.where(known[:, None], euler(trial.q_true()[: len(t)]), np.nan)
     for k, (panel, name) in enumerate(zip(panels, ANGLES, strict=False)):
-        line = np.interp(t, t[known], np.unwrap(reference[known, k], period=360))
-        on = np.ptp(line) <= _TURNS * 360
         if truth:
-            shown = line if on else wrap(line)
-            shown = np.where(known, shown, np.nan)[::step]
-            panel.plot(t[::step], _broken(shown), color="0.72", linewidth=4, label="truth")
+            shown = _broken(reference[::step, k])
+            panel.plot(t[::step], shown, color="0.72", linewidth=4, label="truth")
         for q, look in zip(turned, looks, strict=True):
-            angle = euler(q)[:, k]
-            angle = line + wrap(angle - line) if on else angle
-            panel.plot(t[::step], _broken(angle[::step]), linewidth=0.9, **look)
+            angle = euler(q)[::step, k]
+            panel.plot(t[::step], _broken(angle), linewidth=0.9, **look)
         panel.set_ylabel(f"{name}, deg")
     if truth:
         _errors(trial, rows, turned, t, known, panels[3:], step, looks)
