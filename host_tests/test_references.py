@@ -208,7 +208,7 @@ def test_euler_angles_are_scipys(rotation, order, q):
     q = fixmath.unit_quaternion(*q)
     true = rotation.from_quat(scalar_last(q))
     roll, pitch, yaw = euler_of(q, order)
-    # three roundings of half a millidegree, and the errors of three CORDICs
+    # three roundings of half a millidegree, and the errors of three arctangents
     assert degrees_apart(true, from_euler(rotation, order, roll, pitch, yaw)) < 0.002
     matrix = true.as_matrix()
     lean = -matrix[2, 0] if order == "zyx" else matrix[2, 1]

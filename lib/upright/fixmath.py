@@ -121,15 +121,6 @@ def turn(s: ptr32):
 
 
 # ------------------------------------- main loop: allocates nothing, shares no memory with a tick
-# atan(2**-i) in degrees, Q20
-# fmt: off
-_ATAN = array("i", [
-    47185920, 27855475, 14718068, 7471121, 3750058, 1876857, 938658, 469357,
-    234682, 117342, 58671, 29335, 14668, 7334, 3667, 1833, 917, 458, 229, 115, 57, 29, 14, 7,
-])
-# fmt: on
-
-
 @micropython.viper
 def _euler(q: ptr32, out: ptr32, zxy: int):
     """euler() with the order as 0 or 1.
@@ -137,8 +128,8 @@ def _euler(q: ptr32, out: ptr32, zxy: int):
     Both orders are the same problem: with (a, b) = (q2, q1) for zyx and (q1, -q2) for zxy,
     (q0 + a, q3 - b) has the length cos(pitch/2) + sin(pitch/2) and the direction (yaw -+ roll)/2,
     (q0 - a, q3 + b) has the length cos(pitch/2) - sin(pitch/2) and the direction (yaw +- roll)/2.
-    So three CORDICs without one product give all, and near gimbal lock only the direction of the
-    vanishing one is lost: the sum or difference of yaw and roll, and pitch, stay exact.
+    So three directions give all, and near gimbal lock only that of the vanishing one is lost: the
+    sum or difference of yaw and roll, and pitch, stay exact.
     """
     out[0] = 0 - 1
     k = 0
@@ -152,72 +143,86 @@ def _euler(q: ptr32, out: ptr32, zxy: int):
         k = a
         a = b
         b = 0 - k
-    table = ptr32(_ATAN)
-    x = w + a
-    y = z - b
+    angles = ptr32(_ATAN)
+    lengths = ptr32(_LENGTH)
+    u = w + a
+    v = z - b
     plus = 0
     minus = 0
-    plus_length = 0
+    length = 0
+    angle = 0
     k = 0
     while k < 3:
-        # CORDIC, vectoring: angle of (x, y) in degrees, Q20; x ends as 1.64676 times the length
-        angle = 0
-        if x < 0:
-            angle = 188743680  # 180
-            if y < 0:
-                angle = 0 - angle
-            x = 0 - x
-            y = 0 - y
-        i = y
-        if i < 0:
-            i = 0 - i
+        # x, y: the longer and the shorter of (u, v), without signs; x up to 2**28 and more
+        x = u
+        if u < 0:
+            x = 0 - u
+        y = v
+        if v < 0:
+            y = 0 - v
+        steep = x < y
+        if steep:
+            angle = x
+            x = y
+            y = angle
         shift = 0
-        while x + i < 0x10000000 and shift < 24:
+        while x < 0x10000000 and shift < 28:
             x <<= 1
             y <<= 1
-            i <<= 1
             shift += 1
-        i = 0
-        while i < 24:
-            t = y >> i
-            if y > 0:
-                y -= x >> i
-                x += t
-                angle += table[i]
-            else:
-                y += x >> i
-                x -= t
-                angle -= table[i]
-            i += 1
+        # t = y / x, Q22: 14 bits, and 8 of what is left
+        h = (x >> 14) + 1
+        t = y // h
+        y -= t * h - ((16384 - (x & 16383)) * t >> 14)
+        t = (t << 8) + (y << 8) // h
+        if t > 0x3FFFFF:
+            t = 0x3FFFFF
+        i = t >> 15
+        t &= 32767
+        # angle: of (u, v), Q17 of a degree
+        angle = angles[i]
+        angle += (angles[i + 1] - angle) * (t >> 1) >> 14
+        if steep:
+            angle = 11796480 - angle  # 90
+        if u < 0:
+            angle = 23592960 - angle  # 180
+        if v < 0:
+            angle = 0 - angle
+        if k == 2:
+            break
+        # its length: x (1 + t**2)**0.5, Q22, less the bend of the curve, 1 - t/2 in the middle
+        y = lengths[i]
+        y += ((lengths[i + 1] - y) * t >> 15) - ((t * (32768 - t) >> 15) * (256 - i) >> 16)
+        x += ((x >> 15) * (y >> 4) >> 3) + ((x & 32767) * (y >> 6) >> 16)
         x >>= shift
         if k == 0:
             plus = angle
-            plus_length = x
-            x = w - a
-            y = z + b
-        elif k == 1:
+            length = x
+            u = w - a
+            v = z + b
+        else:
             minus = angle
             # lock: the shorter one has no direction left; take roll as 0
             if x < 1024:
                 minus = plus
-            elif plus_length < 1024:
+            elif length < 1024:
                 plus = minus
-            y = x >> 1
-            x = plus_length >> 1
+            u = length
+            v = x
         k += 1
-    out[1] = (((94371840 - (angle << 1)) >> 5) * 125 + 2048) >> 12  # 90 - 2 angle
-    x = minus - plus
+    out[1] = ((11796480 - (angle << 1) >> 1) * 125 + 4096) >> 13  # 90 - 2 angle
+    u = minus - plus
     if zxy:
-        x = 0 - x
-    y = minus + plus
+        u = 0 - u
+    v = minus + plus
     k = 0
     while k < 3:
-        if x > 188743680:
-            x -= 377487360
-        elif x < 0 - 188743680:
-            x += 377487360
-        out[k] = ((x >> 5) * 125 + 2048) >> 12
-        x = y
+        if u > 23592960:
+            u -= 47185920
+        elif u < 0 - 23592960:
+            u += 47185920
+        out[k] = ((u >> 1) * 125 + 4096) >> 13
+        u = v
         k += 2
 
 
@@ -394,3 +399,27 @@ def _bits(n):
         n >>= 1
         bits += 1
     return bits
+
+
+def _tables():
+    """(atan(t) in degrees, Q17; (1 + t**2)**0.5 - 1, Q22), each of t = 0, 1/128 ... 1.
+
+    Between them the kernels go straight. So an angle is moved outwards by half of what a chord is off.
+    """
+    one = 1 << 40
+    angles, lengths = array("i", [0]), array("i", [0])
+    angle, root = 0, one
+    for i in range(1, 129):
+        # atan(t) - atan(t - h) = atan(h / (1 + t (t - h)))
+        step = (one << 7) // (16384 + i * (i - 1))
+        angle += step - step * step // one * step // (3 * one)
+        square = 16384 + i * i
+        bend = one * 16 * i // square**2  # h**2 / 16 of the second derivative
+        angles.append(ratio((angle + bend) * 180 * PI_DEN, PI_NUM << 23))
+        for _ in range(2):
+            root = root + (square << 66) // root >> 1
+        lengths.append(ratio(root - one, 1 << 18))
+    return angles, lengths
+
+
+_ATAN, _LENGTH = _tables()
