@@ -458,13 +458,3 @@ def test_on_a_bus_of_its_own_a_trigger_that_was_lost_is_given_again():
     rig.mag_chip.poke(CNTL1, 0)
     assert rig.run(40)
     assert rig.mag.stale <= 1
-
-
-# On the real interpreters
-
-
-def test_the_tick_allocates_nothing(micropython_runtime, portable):
-    lines = portable(micropython_runtime, "ist8310_alloc.py").splitlines()
-    assert len(lines) == 9
-    assert all(" ok 0 " in line for line in lines[:8])
-    assert lines[8].endswith("found")
