@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import warnings
 from fractions import Fraction
 
 import motions
@@ -146,6 +147,17 @@ def test_a_trial_without_magnetometer_or_truth_is_still_a_trial(path):
     nothing = np.full((11, 4), np.nan, "f4")
     assert not trials.load(save(path, q_gt=nothing)).has_truth
     assert not trials.load(save(path, movement=np.zeros(2, "u1"))).has_truth
+
+
+def test_a_truth_of_any_bits_is_read_or_refused_without_a_warning(path):
+    """Found by the million inputs: a signalling NaN."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        signalling = np.full((11, 4), 0x7F800001, "u4").view("f4")
+        assert not trials.load(save(path, q_gt=signalling)).has_truth
+        for dtype, value in (("f8", 1e200), ("f4", np.inf)):
+            with pytest.raises(trials.TrialError, match="no unit quaternions"):
+                trials.load(save(path, q_gt=np.full((11, 4), value, dtype)))
 
 
 def test_a_trial_is_replayed_by_the_world_sample_by_sample(path, tmp_path):

@@ -292,8 +292,9 @@ def _truth(path: Path, arrays: dict, header: dict, n: int) -> tuple:
     m = -(-n // every)
     if q_gt.dtype.kind != "f" or q_gt.shape != (m, 4):
         raise TrialError(f"{path}: q_gt is {q_gt.dtype} {q_gt.shape}, expected floats ({m}, 4)")
-    q_gt = q_gt.astype(float)
-    norm = np.linalg.norm(q_gt, axis=1)
+    with np.errstate(all="ignore"):  # a signalling NaN, numbers whose squares are too large
+        q_gt = q_gt.astype(float)
+        norm = np.linalg.norm(q_gt, axis=1)
     if (np.abs(norm - 1) > 0.01).any() or np.isinf(q_gt).any():  # false for NaN: no truth
         raise TrialError(f"{path}: q_gt holds rows that are no unit quaternions")
     if "movement" not in arrays:
