@@ -208,6 +208,17 @@ def test_a_qmc5883l_is_no_ist8310_that_did_not_come_out_of_reset():
         IST8310(rig.i2c, 0x0D).configure()
 
 
+@pytest.mark.parametrize("name", KINDS)
+def test_an_address_in_the_8_bit_form_is_told(name):
+    """0x3C and 0x3D, as the HMC5883L's datasheet writes them, are addresses of displays."""
+    for address in KINDS[name][0].ADDRESSES:
+        for form in (address << 1, address << 1 | 1):
+            with pytest.raises(
+                ValueError, match=f"0x{form:02x} is the 8-bit form: pass 0x{address:02x}"
+            ):
+                KINDS[name][0](machine.I2C(0), form)
+
+
 # Bypass
 
 
@@ -403,6 +414,7 @@ def test_the_table_of_the_search_is_the_drivers():
         driver = magnetometers.driver(name)
         assert driver.chip == name
         assert (register, identity) == driver.IDENTITY
+        assert sorted(addresses) == sorted(driver.ADDRESSES)
         assert driver(machine.I2C(0))._registers.address in addresses
 
 

@@ -296,7 +296,7 @@ def test_a_bus_that_times_out_is_not_called_nobody_there():
         I2C.driver().configure()
 
 
-@pytest.mark.parametrize("address", [0xD0, 0xD2])
+@pytest.mark.parametrize("address", [0xD0, 0xD1, 0xD2, 0x78])
 def test_an_address_as_modules_print_it_is_answered_with_the_one_that_is_meant(address):
     with pytest.raises(ValueError, match=rf"8-bit form.*0x{address >> 1:02x}"):
         MPU6050(I2C.bus(), address=address)

@@ -44,6 +44,7 @@ class AK8963(Magnetometer):
     """
 
     chip = "AK8963"
+    ADDRESSES = (0x0C,)
     error_class = AK8963Error
     IDENTITY = (_WIA, b"\x48")
     AVERAGES = {1: 9000}  # DS, Analog Circuit Characteristics: 7.2 ms, at most 9

@@ -40,6 +40,7 @@ class HMC5883L(Magnetometer):
     """
 
     chip = "HMC5883L"
+    ADDRESSES = (0x1E,)
     error_class = HMC5883LError
     lsb_per_uT = (109, 10)  # DS table 9: 1090 LSB/Ga at +-1.3 Ga
     IDENTITY = (_IDENTIFICATION_A, b"H43")

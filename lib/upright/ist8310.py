@@ -47,6 +47,7 @@ class IST8310(Magnetometer):
     """
 
     chip = "IST8310"
+    ADDRESSES = (0x0C, 0x0D, 0x0E, 0x0F)
     error_class = IST8310Error
     lsb_per_uT = (33, 10)  # DS 4.4, 14 bits
     # DS 3.1 says 5 ms for its default, an average of 4, and 6 ms for 16; for 8 the longer one

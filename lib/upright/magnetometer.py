@@ -9,7 +9,7 @@ from array import array
 import micropython
 from micropython import const
 
-from upright.registers import I2CRegisters
+from upright.registers import I2CRegisters, eight_bits
 
 _MAG_FRESH = const(2)
 _COUNT_MASK = const(0x3FFFFFFF)
@@ -115,6 +115,7 @@ class Magnetometer:
 
         chip, error_class   the name, and the class of its exceptions, an OSError
         lsb_per_uT          (num, den)
+        ADDRESSES           that it can have
         IDENTITY            (register, its bytes)
         AVERAGES            {readings to a measurement: least us from one measurement to the next}
         AVERAGE             the default; None: the largest
@@ -136,6 +137,8 @@ class Magnetometer:
     """
 
     def __init__(self, bus, address):
+        if isinstance(address, int) and address >> 1 in self.ADDRESSES:
+            raise eight_bits(address)
         if hasattr(bus, "device"):
             self._registers = self._link = bus.device(address)
         else:

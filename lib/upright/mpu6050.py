@@ -33,8 +33,6 @@ class I2CPort:
     after_reset = ()
 
     def __init__(self, i2c, address, accept_unknown, error_class, name, only_6500):
-        if address in (0xD0, 0xD2):
-            raise ValueError(f"0x{address:02x} is the 8-bit form: pass 0x{address >> 1:02x}")
         self.registers = I2CRegisters(
             i2c, _ADDRESSES[0] if address is None else address, error_class, mpu_parts.name
         )
@@ -119,7 +117,7 @@ class I2CPort:
                 "chip was cut off in a read"
             )
         if self.searches:
-            return f"no {self._name} at 0x68 or 0x69; {check} {tried}"
+            return f"no {self._name} at 0x68 or 0x69. {check} {tried}"
         address = self.registers.address
         other = 0x69 if address == 0x68 else 0x68
         answers = self._ask((other,))

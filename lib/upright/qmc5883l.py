@@ -40,6 +40,7 @@ class QMC5883L(Magnetometer):
     """
 
     chip = "QMC5883L"
+    ADDRESSES = (0x0D,)
     error_class = QMC5883LError
     lsb_per_uT = (30, 1)  # DS table 2: 3000 LSB/Ga at +-8 Ga
     IDENTITY = (_CHIP_ID, b"\xff")

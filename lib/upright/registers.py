@@ -14,6 +14,11 @@ def plain_name(register):
     return f"register 0x{register:02x}"
 
 
+def eight_bits(address):
+    """The ValueError for an address in the form of data sheets and modules, with the bit for reading behind it."""
+    return ValueError(f"0x{address:02x} is the 8-bit form: pass 0x{address >> 1:02x}")
+
+
 class Registers:
     """Register access for a driver's set-up; a subclass transfers the bytes. For the tick every bus has
 
@@ -74,8 +79,10 @@ class I2CRegisters(Registers):
         Registers.__init__(self, error_class, name)
         if not hasattr(i2c, "readfrom_mem_into"):
             raise TypeError(f"{i2c!r} is not an I2C bus")
-        if not isinstance(address, int) or not 0x08 <= address <= 0x77:
+        if not isinstance(address, int) or not 0x08 <= address <= 0xFF:
             raise ValueError(f"address {address!r} is not an int, 0x08 to 0x77")
+        if address > 0x77:
+            raise eight_bits(address)
         self.address = address
         self.bus = i2c
         self._out = bytearray(2)

@@ -175,10 +175,12 @@ class SSD1306(Canvas):
         if not i2c and not callable(dc):
             raise ValueError("a display on SPI needs dc=, the output pin that its D/C is wired to")
         if i2c and address not in (0x3C, 0x3D):
-            hint = "must be 0x3C or 0x3D"
-            if address >> 1 in (0x3C, 0x3D):
-                hint = "is the 8-bit form, as modules print it: pass 0x%02X" % (address >> 1)
-            raise ValueError("display address 0x%02X %s" % (address, hint))
+            if not isinstance(address, int) or address >> 1 not in (0x3C, 0x3D):
+                raise ValueError("display address %r must be 0x3C or 0x3D" % (address,))
+            raise ValueError(
+                "display address 0x%02X is the 8-bit form, as modules print it: pass 0x%02X"
+                % (address, address >> 1)
+            )
         sh1106, width, height = _parse(panel)
         if not isinstance(chunk, int) or chunk % _BLOCK or not 8 <= chunk <= 128:
             raise ValueError("chunk must be a multiple of 8 from 8 to 128 bytes, not %r" % (chunk,))
