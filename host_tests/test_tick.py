@@ -263,6 +263,22 @@ def test_a_tick_that_raised_is_a_step_all_the_same(tick, filter, imu):
     assert (tick.crashes, filter.flags) == (2, [0, 0])
 
 
+def test_a_tick_is_one_crash_although_the_filter_raises_in_the_step_made_up_for_too(tick, filter):
+    tried = []
+
+    def broken(counts):
+        tried.append(counts[10])
+        if len(tried) == 6:
+            raise KeyboardInterrupt
+        raise ValueError("the filter")
+
+    filter.update = broken
+    ticks_at(tick, [5000, 10000])
+    assert (tick.crashes, tried, tick.interrupt) == (2, [1, 0, 1, 0], None)
+    ticks_at(tick, [15000])
+    assert tick.crashes == 3 and isinstance(tick.interrupt, KeyboardInterrupt)
+
+
 def test_a_stale_sample_is_a_coasting_step_and_health_is_looked_at(tick, filter, imu):
     imu.flags = 0
     ticks_at(tick, [5000, 10000, 15000])

@@ -166,8 +166,8 @@ class Tick:
     `on_sample` and `on_fifo` are the callbacks: on_sample for a timer or the chip's data-ready line, on_fifo for a
     timer that drains the FIFO. (They are made once, because fetching a bound method allocates.) They never raise.
     The filter coasts through packets that the FIFO has lost, as through ticks that did not come.
-    Faults are counted in `missed` (ticks that did not come), `crashes` (the last one is
-    in `error`), `step_errors` (of on_step; the last one is in `step_error`), and in the counters of driver and display.
+    Faults are counted in `missed` (ticks that did not come), `crashes` (ticks that raised; the last exception is in
+    `error`), `step_errors` (of on_step; the last one is in `step_error`), and in the counters of driver and display.
     A KeyboardInterrupt during the tick is stored in `interrupt`, for the main program to raise.
 
     period_us         the sample period, to detect missed ticks; 0 with the FIFO, where each packet is a step
@@ -321,23 +321,20 @@ class Tick:
 
     @micropython.native
     def _crashed(self, error):
-        self._count_crash(error)
-        if self._marks[_RUNNING] != _STEPPED:  # a step is always one step
-            try:
-                self._counts[10] &= ~_ANY_FRESH
-                self._filter.update(self._counts)
-            except BaseException as another:
-                self._count_crash(another)
-        if self._black_box is not None:
-            self._black_box.look()
-
-    @micropython.native
-    def _count_crash(self, error):
         if isinstance(error, Exception):
             self.crashes = (self.crashes + 1) & _WRAP
             self.error = error
         else:
             self.interrupt = error
+        if self._marks[_RUNNING] != _STEPPED:  # a step is always one step
+            try:
+                self._counts[10] &= ~_ANY_FRESH
+                self._filter.update(self._counts)
+            except BaseException as another:  # of the same tick, which is counted
+                if not isinstance(another, Exception):
+                    self.interrupt = another
+        if self._black_box is not None:
+            self._black_box.look()
 
     @micropython.native
     def _on_time(self):
