@@ -10,6 +10,7 @@ from collections import Counter
 from pathlib import Path
 
 import hypothesis
+import numpy as np
 import pytest
 from hypothesis import strategies as st
 from upright_host import faults, library, paths, simulate
@@ -33,7 +34,6 @@ def test_every_plan_is_within_the_bounds(name, rig):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    # not main-raises: how long a start takes is the runtime's own
     "name",
     ["brown-out", "sda-low", "nack-burst", "masked-long"],
 )
@@ -42,6 +42,30 @@ def test_a_plan_comes_out_the_same_on_every_runtime(name, rig, runtime):
     there, here = [faults.run(case, each, rig.world(case)) for each in (runtime, "cpython")]
     assert (there.q == here.q).all()
     keys = ("steps", "fresh", "missed", "crashes", "errors", "resets", "changes")
+    assert [there.result[key] for key in keys] == [here.result[key] for key in keys]
+
+
+@pytest.mark.slow
+def test_a_start_anew_comes_out_the_same_but_for_its_length(rig, runtime):
+    """How long a start takes is the runtime's own. Until then both are the same; then each goes on step by step."""
+    case = PLANS["main-raises"]
+    at = case.faults[0][0]
+    there, here = [faults.run(case, each, rig.world(case)) for each in (runtime, "cpython")]
+    assert (there.q[there.times < at] == here.q[here.times < at]).all()
+    period = here.result["period_us"]
+    begun = []
+    for each in (there, here):
+        gaps = np.diff(each.times)
+        first = int(gaps.argmax()) + 1
+        assert each.times[first - 1] >= at - period and gaps[first - 1] > 100 * period
+        assert (abs(gaps[first:] - period) < period // 2).all(), (
+            "none is missed; the times are those of the ends of the ticks"
+        )
+        assert each.result["steps"] == len(each.times) - first
+        assert (each.flags[first:] & 1).all()
+        begun.append(each.times[first])
+    assert abs(begun[0] - begun[1]) < 20 * period
+    keys = ("missed", "crashes", "errors", "resets", "full_resets", "changes")
     assert [there.result[key] for key in keys] == [here.result[key] for key in keys]
 
 
@@ -160,7 +184,7 @@ def day(seed, seconds):
 
 @pytest.mark.soak
 @pytest.mark.slow
-@pytest.mark.parametrize("part", range(5))
+@pytest.mark.parametrize("part", range(6))
 def test_a_day_of_faults_ends_with_every_counter_as_it_was_injected(part, soaking):
     """make soak runs 6 parts of 4 hours, make test 6 of 10 minutes. The clocks of each part wrap after 2 minutes."""
     seconds = 4 * 3600 if soaking else 600
