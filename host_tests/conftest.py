@@ -232,6 +232,18 @@ def micropython_runtime(request):
     return require(request.param)
 
 
+@pytest.fixture(params=[name for name in runtimes.NAMES if name != "m3"])
+def firmware_runtime(request):
+    """Each runtime in turn for a whole flight of the firmware, but one emulated board only: there it takes long."""
+    return require(request.param)
+
+
+@pytest.fixture(params=[name for name in runtimes.NAMES if name not in qemu.RECIPES])
+def quick_runtime(request):
+    """Each runtime in turn but the emulated boards, for many flights of the firmware."""
+    return require(request.param)
+
+
 @pytest.fixture
 def upright():
     """upright(*arguments) -> the result of the command line, with exit_code, output, stdout and stderr."""

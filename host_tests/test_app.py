@@ -28,8 +28,10 @@ def dark(picture):
     return not any(any(row) for row in picture)
 
 
-def test_it_boots_and_is_right_on_every_runtime_with_the_same_bits(runtime, boot, demo_world):
-    run = boot(runtime, seconds=6)
+def test_it_boots_and_is_right_on_every_runtime_with_the_same_bits(
+    firmware_runtime, boot, demo_world
+):
+    run = boot(firmware_runtime, seconds=6)
     healthy(run.result)
     assert run.result["missed"] == run.result["errors"] == 0
     assert run.result["bias_known"]
@@ -40,7 +42,7 @@ def test_it_boots_and_is_right_on_every_runtime_with_the_same_bits(runtime, boot
     assert score.aligned_total < 1.0
     assert any("MPU6050" in line for line in run.lines)
     assert not dark(run.picture)
-    if runtime != "cpython":
+    if firmware_runtime != "cpython":
         there = boot("cpython", seconds=6)
         assert (run.rows == there.rows).all()
         assert (run.q29 == there.q29).all()

@@ -37,9 +37,9 @@ def test_every_plan_is_within_the_bounds(name, rig):
     "name",
     ["brown-out", "sda-low", "nack-burst", "masked-long"],
 )
-def test_a_plan_comes_out_the_same_on_every_runtime(name, rig, runtime):
+def test_a_plan_comes_out_the_same_on_every_runtime(name, rig, quick_runtime):
     case = PLANS[name]
-    there, here = [faults.run(case, each, rig.world(case)) for each in (runtime, "cpython")]
+    there, here = [faults.run(case, each, rig.world(case)) for each in (quick_runtime, "cpython")]
     assert (there.q == here.q).all()
     keys = ("steps", "fresh", "missed", "crashes", "errors", "resets", "changes")
     assert [there.result[key] for key in keys] == [here.result[key] for key in keys]

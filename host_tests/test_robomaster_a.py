@@ -316,8 +316,8 @@ def longest_gap(run, bit, since_us=0):
     return int(np.diff(run.times[(run.times >= since_us) & (run.flags & bit != 0)]).max())
 
 
-def test_nine_axes_at_1_khz_on_every_runtime_with_the_same_bits(runtime, boot, demo_world):
-    run = boot(runtime)
+def test_nine_axes_at_1_khz_on_every_runtime_with_the_same_bits(firmware_runtime, boot, demo_world):
+    run = boot(firmware_runtime)
     healthy(run.result)
     assert run.result["missed"] == run.result["errors"] == run.result["mag_errors"] == 0
     assert run.result["filter"] == FILTER
@@ -329,7 +329,7 @@ def test_nine_axes_at_1_khz_on_every_runtime_with_the_same_bits(runtime, boot, d
     assert score.inclination < 0.6
     assert score.total < 1.5
     assert any("IST8310" in line for line in run.lines)
-    if runtime != "cpython":
+    if firmware_runtime != "cpython":
         there = boot("cpython")
         assert (run.rows == there.rows).all()
         assert (run.q29 == there.q29).all()
