@@ -172,6 +172,17 @@ def test_terminal_form_fits_the_width():
     assert [len(line) for line in oled.terminal(rows, 132)] == [128] * 32
 
 
+def test_a_terminal_of_another_encoding_gets_characters_that_it_has():
+    """With LANG=C the picture was a wall of question marks."""
+    rows = checker()
+    rows[:8] = [bytearray(128)] * 8
+    for columns, wide in ((80, 64), (132, 128)):
+        lines = oled.terminal(rows, columns, "ascii")
+        assert {len(line) for line in lines} == {wide}
+        assert len(set("".join(lines))) >= 2 and "?" not in "".join(lines)
+    assert set("".join(oled.terminal([bytearray(128)] * 64, 80, "ascii"))) == {" "}
+
+
 def test_braille_and_half_blocks_show_each_dot():
     rows = [bytearray(2) for _ in range(4)]
     assert oled.braille(rows) == ["\u2800"] and oled.half_blocks(rows) == ["  ", "  "]

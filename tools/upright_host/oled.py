@@ -6,6 +6,7 @@ simulated display); `rows_of_frame` makes one from bytes in the display's own pa
 `buffer` of the writer).
 """
 
+import sys
 from pathlib import Path
 
 from PIL import Image, ImageChops
@@ -20,6 +21,7 @@ _EDGE = (58, 68, 80)
 
 # bit of each dot of a braille cell, by row and column (Unicode block 2800)
 _DOTS = ((0x01, 0x08), (0x02, 0x10), (0x04, 0x20), (0x40, 0x80))
+_SHADES = " ..::+*##"  # by the dots of a cell
 _HALVES = " \u2580\u2584\u2588"
 
 
@@ -120,12 +122,27 @@ def half_blocks(rows) -> list[str]:
     return lines
 
 
-def terminal(rows, columns: int = 80) -> list[str]:
-    """Lines of text in the largest form that fits so many columns, with a frame around it."""
-    return half_blocks(rows) if columns >= len(rows[0]) + 4 else braille(rows)
+def terminal(rows, columns: int = 80, encoding: str = "utf-8") -> list[str]:
+    """Lines of text in the largest form that fits so many columns, with a frame around it. Where the encoding has no
+    such characters, it is made of others."""
+    lines = half_blocks(rows) if columns >= len(rows[0]) + 4 else braille(rows)
+    try:
+        "".join(lines).encode(encoding)
+        return lines
+    except UnicodeEncodeError:
+        return ["".join(map(_plain, line)) for line in lines]
+
+
+def _plain(character: str) -> str:
+    """An ASCII character for a half block, or one as dark as a braille cell."""
+    cell = ord(character) - 0x2800
+    return _SHADES[cell.bit_count()] if 0 <= cell < 256 else " '.:"[_HALVES.index(character)]
 
 
 def panel(rows, columns: int = 80, title: str | None = None, subtitle: str | None = None) -> Panel:
     """The same in a rich panel, for a live display."""
-    text = Text("\n".join(terminal(rows, columns)), style="bright_cyan on black", no_wrap=True)
+    encoding = sys.stdout.encoding or "utf-8"
+    text = Text(
+        "\n".join(terminal(rows, columns, encoding)), style="bright_cyan on black", no_wrap=True
+    )
     return Panel(text, title=title, subtitle=subtitle, expand=False, border_style="grey42")
