@@ -542,7 +542,7 @@ def test_a_program_with_asyncio_gets_readings_step_by_step_beside_its_other_task
     readings = [words for words in said if words[:1] == ["reading"]]
     first, last = (int(words[4]) for words in readings)
     assert first >= 50 and last - first >= 50
-    assert last <= 112  # a collection of garbage or two; otherwise none is missed
+    assert last <= 116  # two collections of garbage, 33 ms each; otherwise none is missed
     assert all(abs(float(word)) < 1 for words in readings for word in words[6:])
     assert sum(words[:2] == ["other", "task"] for words in said) >= 1
 

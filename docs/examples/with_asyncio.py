@@ -1,5 +1,5 @@
 # The attitude beside other tasks: `await imu.next()` gives the reading of the next step. While the interpreter collects
-# garbage (25 ms on a Pico) the tick goes on, but this program does not: reading.step tells how many steps went by.
+# garbage (33 ms on a Pico) the tick goes on, but this program does not: reading.step tells how many steps went by.
 
 import asyncio
 
