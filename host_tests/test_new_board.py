@@ -52,3 +52,9 @@ def test_a_board_without_simulated_chips_is_not_simulated(boards):
 
 def test_every_board_that_comes_with_upright_can_be_simulated():
     assert set(paths.boards()) == set(library.simulator("boards").BOARDS)
+
+
+def test_a_module_with_a_name_of_any_length_is_told_to_be_none_of_upright():
+    """Found by the million inputs: longer than a file's name can be."""
+    (line,) = contents.lines_to_change(f"from upright.{'x' * 300} import a\n", set(), True)
+    assert line.startswith("line 1: there is no upright/xxx")

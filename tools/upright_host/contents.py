@@ -1,6 +1,7 @@
 """What an installation consists of: the modules that a board's settings need, compiled for its processor."""
 
 import ast
+import os
 import subprocess
 import tempfile
 import warnings
@@ -321,7 +322,9 @@ def _unknown(module: str, name: str) -> str | None:
     if package != "upright" or not module:
         return None
     path = paths.PACKAGE / f"{module}.py"
-    if not path.exists():
+    if not os.path.exists(
+        path
+    ):  # where Path.exists() raises for a name that is too long, this does not
         return f"there is no upright/{module}.py"
     names = set()
     for node in ast.walk(packages.tree(path)):
