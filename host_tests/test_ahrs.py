@@ -71,6 +71,19 @@ def run(seconds):
 # ------------------------------------------------------------------------------- readings
 
 
+@pytest.mark.parametrize("filter", ["inertial6", "mahony6", "quaternion-kalman6"])
+def test_an_axis_at_full_scale_is_no_attitude_to_start_with(filter):
+    said = []
+    imu, world = start((32767, 0, G), filter=filter, log=lambda *words: said.append(words))
+    assert imu.angles() == (0, 0, 0)
+    assert any("no usable accelerometer sample" in str(words[0]) for words in said)
+    run(0.5)
+    assert max(abs(angle) for angle in imu.angles()) < 0.5
+    world.set(gravity(5, 0))
+    run(20)
+    assert imu.angles()[0] == pytest.approx(5, abs=1.5)
+
+
 def test_before_the_first_step_the_angles_are_those_of_the_start():
     imu, _ = start(gravity(20, -10))
     assert imu.tick.steps == 0

@@ -246,7 +246,7 @@ def test_a_float_in_the_tick_fails(landed):
     )
     before, after, later, error = said.split(None, 3)
     assert before == "0"
-    assert int(after) == 11  # ticks in 52 ms
+    assert int(after) in (10, 11)  # ticks in 52 ms, one crash each
     assert later == "0"
     assert "MemoryError" in error
 
