@@ -1,7 +1,8 @@
 """MicroPython's qemu port as a runtime: the host's files on the board, and what its compilers make of viper code."""
 
+import shutil
 import subprocess
-import sys
+import time
 
 import pytest
 from conftest import PORTABLE, require
@@ -99,7 +100,7 @@ def test_a_board_ends_with_its_host_process(board):
     for _ in range(200):
         if not alive(child):
             return
-        subprocess.run([sys.executable, "-c", "import time; time.sleep(0.05)"])
+        time.sleep(0.05)
     pytest.fail("the emulated board goes on")
 
 
@@ -122,6 +123,17 @@ def test_a_firmware_that_does_not_come_up_is_said(board, tmp_path):
     done = subprocess.run([*start, "-c", "pass"], capture_output=True, text=True, timeout=60)
     assert done.returncode == 1
     assert "the board ended with" in done.stderr
+
+
+def test_a_failure_before_the_program_is_said(board, tmp_path):
+    start, _ = runtimes.interpreter(board)
+    run_py = next(i for i, word in enumerate(start) if word.endswith("run.py"))
+    shutil.copy(start[run_py], tmp_path)
+    (tmp_path / "board.py").write_text("print('begins')\n1 / 0\n")
+    start = [*start[:run_py], str(tmp_path / "run.py"), *start[run_py + 1 :]]
+    done = subprocess.run([*start, "-c", "pass"], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (1, "begins\n")
+    assert done.stderr.splitlines()[-1] == "ZeroDivisionError: divide by zero"
 
 
 # ---------------------------------------------------------------- compiled code
@@ -186,6 +198,6 @@ def test_what_the_runtimes_compiler_gets_wrong_is_what_the_docs_say(micropython_
     assert wrong == expected
 
 
-def test_the_simulators_board_py_is_small_enough_for_the_raw_prompt():
-    """It is read line by line into the heap of 3.6 MB; a byte beyond ASCII would be refused there."""
-    assert (paths.SIMULATOR / "qemu" / "board.py").read_text("ascii").count("\x04") == 0
+def test_what_goes_over_the_raw_prompt_has_no_byte_that_ends_it():
+    text = (paths.SIMULATOR / "qemu" / "board.py").read_text("ascii")
+    assert not {"\x01", "\x02", "\x03", "\x04", "\x05"} & {*text}

@@ -17,6 +17,7 @@ from pathlib import Path
 BOOT = Path(__file__).with_name("board.py")
 _BEGIN = b"raw REPL; CTRL-B to exit\r\n>"
 _END = b"\x04"  # behind the program's output, and behind that of a board.py that failed
+_PROMPT = b"\x04>"
 
 
 def main(arguments):
@@ -66,13 +67,15 @@ def _talk(board, boot):
         said = said[keep:]
         if not piece:
             break
-    try:
-        return board.wait(2)
-    except subprocess.TimeoutExpired:  # board.py failed, and the prompt is back
-        board.kill()
-        after += board.stdout.read()
-        os.write(2, after.partition(_END)[0].replace(b"\r\n", b"\n"))
-        return 1
+    # a program that has ended takes the board with it; when board.py has failed the prompt is back, behind a traceback
+    while piece and not after.endswith(_PROMPT):
+        piece = os.read(board.stdout.fileno(), 1 << 16)
+        after += piece
+    if not piece:
+        return board.wait()
+    board.kill()
+    os.write(2, after.removesuffix(_PROMPT).replace(b"\r\n", b"\n"))
+    return 1
 
 
 def _wait_for(board, what):
