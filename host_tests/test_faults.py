@@ -35,7 +35,7 @@ def test_every_plan_is_within_the_bounds(name, rig):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
-    ["brown-out", "sda-low", "nack-burst", "masked-long"],
+    ["brown-out", "sda-low", "nack-burst", "masked-long", "zeros", "axis-full", "silent-fifo"],
 )
 def test_a_plan_comes_out_the_same_on_every_runtime(name, rig, quick_runtime):
     case = PLANS[name]

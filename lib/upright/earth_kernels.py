@@ -138,12 +138,13 @@ def believe_later(s: ptr32, north: int, west: int, up: int, end: int):
 
 
 @micropython.viper
-def to_earth(s: ptr32, counts: ptr16):
+def to_earth(state, counts: ptr16):
     """R of Q; the specific force in the earth frame goes into the sum FS, a fresh magnetometer sample into MS, MN.
 
     The accelerometer is used as measured, neither normalised nor left out at full scale, so that swings cancel; but
     see believe_later(). A magnetometer sample is left out when all of it is zero or an axis is at full scale.
     """
+    s = ptr32(state)
     k = 0
     if s[_PROBE] > 0:
         k = 32
@@ -197,7 +198,7 @@ def to_earth(s: ptr32, counts: ptr16):
         elif z < 0 - a:
             end = 6
     if end | s[_FULL_END] | s[_LATER_ANY]:
-        believe_later(s, north, west, up, end)
+        believe_later(state, north, west, up, end)  # a pointer would be boxed
     else:
         s[_FS] = s[_FS] + north
         s[_FS + 1] = s[_FS + 1] + west
