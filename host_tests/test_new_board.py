@@ -1,9 +1,10 @@
 """`upright board new`: a folder for a board that has none."""
 
+import ast
 import shutil
 
 import pytest
-from upright_host import contents, library, new_board, options, paths
+from upright_host import contents, library, new_board, options, packages, paths
 from upright_host.console import Wrong
 
 
@@ -58,3 +59,4 @@ def test_a_module_with_a_name_of_any_length_is_told_to_be_none_of_upright():
     """Found by the million inputs: longer than a file's name can be."""
     (line,) = contents.lines_to_change(f"from upright.{'x' * 300} import a\n", set(), True)
     assert line.startswith("line 1: there is no upright/xxx")
+    assert packages.imports(ast.parse(f"from upright import {'x' * 300}")) == set()

@@ -1,7 +1,6 @@
 """What an installation consists of: the modules that a board's settings need, compiled for its processor."""
 
 import ast
-import os
 import subprocess
 import tempfile
 import warnings
@@ -322,9 +321,7 @@ def _unknown(module: str, name: str) -> str | None:
     if package != "upright" or not module:
         return None
     path = paths.PACKAGE / f"{module}.py"
-    if not os.path.exists(
-        path
-    ):  # where Path.exists() raises for a name that is too long, this does not
+    if not paths.has_module(module):
         return f"there is no upright/{module}.py"
     names = set()
     for node in ast.walk(packages.tree(path)):

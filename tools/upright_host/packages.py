@@ -65,7 +65,7 @@ def imports(tree: ast.Module, late: bool = True) -> set[str]:
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("upright."):
             found.add(node.module.partition(".")[2])
-    return {name for name in found if (paths.PACKAGE / f"{name}.py").exists()}
+    return {name for name in found if paths.has_module(name)}
 
 
 def package_files() -> dict[Path, str]:

@@ -71,6 +71,11 @@ def nearest_board(name: str) -> str | None:
     return known[near[0]] if near else None
 
 
+def has_module(name: str) -> bool:
+    """Whether the library has a module of this name, which may be any text: Path.exists() raises for a long one."""
+    return os.path.exists(PACKAGE / f"{name}.py")
+
+
 def board_path(board: str = "sim", simulated: bool = True) -> list[Path]:
     """The folders that together hold what a board's root and lib folders would."""
     folders = [SIMULATOR] if simulated else []
