@@ -10,6 +10,7 @@ from array import array
 from dataclasses import dataclass
 from functools import lru_cache
 
+import motions
 import numpy as np
 import translate
 from scenes import FIELD_UT, all_axes, errors, pushes, scene
@@ -126,6 +127,26 @@ def as_made(rate, seconds, *arguments, bias_dps=BIAS, **options):
     motion = scene(rate, seconds, *arguments, bias_dps=bias_dps, **options)
     values = bias_dps(motion.t) if callable(bias_dps) else np.array(bias_dps, float)
     motion.bias_dps = np.broadcast_to(values, (motion.n, 3))
+    return motion
+
+
+def mounted(motion, roll):
+    """The same motion seen by a sensor that is mounted with this roll, deg."""
+    mount = motions.exponential(np.radians((roll, 0, 0)))
+    turn = motions._matrix(mount[None])[0]
+    for first in (0, 3, 6):
+        part = slice(first, first + 3)
+        motion.counts[:, part] = np.rint(motion.counts[:, part] @ turn).astype(np.int16)
+    motion.bias_dps = motion.bias_dps @ turn
+    motion.q_true = motions.multiply(motion.q_true, mount)
+    return motion
+
+
+def without_samples(motion, start, end):
+    """The steps of a loop that gets no sample meanwhile: the last one, not fresh."""
+    first, last = int(start * RATE), int(end * RATE)
+    motion.counts[first:last] = motion.counts[first - 1]
+    motion.counts[first:last, 10] = 0
     return motion
 
 
@@ -418,6 +439,56 @@ def _beyond_doubt(run, second):
     off = abs((run.heading[second * RATE - 1] + 180) % 360 - 180)
     return off - run.doubt_deg[second - 1]
 
+
+SCENES["turntable at 1, mounted at 45"] = Scene(
+    lambda: mounted(turntable(1), 45), _of_turntable(1), {(9, "a minute"): 2.5}, (9,)
+)
+for _roll in (10, 45, 90):
+    SCENES[f"car 0.3 g 20 s, mounted at {_roll}"] = Scene(
+        lambda r=_roll: mounted(car(0.3, 20), r),
+        lambda run: {"tilt": run.tilt(60), "heading": run.north(60)},
+        {"tilt": 10, "heading": 5},
+    )
+for _drift, _heading in ((0.03, 5), (0.1, 7), (0.2, 9)):
+    SCENES[f"driving while z drifts by {_drift} a minute"] = Scene(
+        lambda d=_drift: parked((0, 0, d), False, 60),
+        lambda run: {"heading": run.north(60)},
+        {"heading": _heading},
+        (9,),
+    )
+# found again: a turn of which the end was not sampled, one that nothing measured, a spin that ends at rest
+for _dps, _gap, _most in ((250, 0.2, 8), (400, 0.2, 16), (250, 0.45, 8)):
+    SCENES[f"a turn of {_dps} ends in a gap of {_gap} s"] = Scene(
+        lambda d=_dps, g=_gap: without_samples(
+            as_made(
+                RATE,
+                80,
+                lambda t: (
+                    between(t, 38, 40.02) * np.array((0, 0, d)) + gently(t) * between(t, 5, 30)
+                ),
+            ),
+            40,
+            40 + g,
+        ),
+        lambda run, g=_gap: {"heading < 5 after": run.last("heading", 5, 40 + g)},
+        {"heading < 5 after": _most},
+        (9,),
+    )
+SCENES["turned by 170 without samples"] = Scene(
+    lambda: without_samples(
+        as_made(RATE, 80, lambda t: gently(t) * between(t, 5, 30), kick=(41, (0, 0, 170))), 40, 42
+    ),
+    lambda run: {"heading < 5 after": run.last("heading", 5, 42)},
+    {"heading < 5 after": 3},
+    (9,),
+)
+for _moment in range(4):
+    SCENES[f"yaw kick of 130 at rest, {_moment}"] = Scene(
+        lambda k=_moment: as_made(RATE, 80, kick=(40 + 0.044 * k, (0, 0, 130))),
+        lambda run: {"heading < 5 after": run.last("heading", 5, 40)},
+        {"heading < 5 after": 30},
+        (9,),
+    )
 
 # what the gyro has not seen, in a good field: found again as quickly as ever, within a factor of two
 for _name, _moving, _kick, _tilt, _heading in (

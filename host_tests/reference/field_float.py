@@ -23,6 +23,10 @@ STILL_TAU, STILL_E = 5.0, 0.1  # s, rad
 CANDIDATE_E = 0.35  # rad
 FORGOTTEN = 0.3  # rad**2
 GATE_DOUBT = 1.125
+SURE, ANY = (
+    0.3,
+    1.5,
+)  # rad: so much doubt, and a rest says nothing of the heading; any heading is as likely
 
 
 class FieldFloat(EarthFloat):
@@ -62,8 +66,8 @@ class FieldFloat(EarthFloat):
         self.decide(NEAR_OLD, old and not (near and distance(self.old) >= distance(r)))
         self.decide(SAME, r is not None and away(r) < SAME_TOLERANCE)
         self.decide(TURNING, self.rate >= math.radians(p["field_dps"]) ** 2)
-        consistent = abs(e) < p["field_gate"] + GATE_DOUBT * doubt
-        if r is not None and self.still_set and self.rest:
+        consistent = abs(e) < p["field_gate"] + GATE_DOUBT * doubt or doubt > ANY
+        if r is not None and self.still_set and self.rest and doubt < SURE:
             consistent = consistent and abs(wrap(e - self.still_e)) <= STILL_E
         self.decide(CONSISTENT, consistent)
         candidate = away(self.candidate) < p["field_tolerance"]
@@ -116,7 +120,7 @@ class FieldFloat(EarthFloat):
             self.open_bias()
         self.weight = int(good or self.reference is None)
         if self.weight:
-            if self.still_set and self.rest:
+            if self.still_set and self.rest and self.doubt < SURE:
                 k = self.T2 / (STILL_TAU + self.T2)
                 self.still_e += k * wrap(e - self.still_e)
             else:
@@ -125,7 +129,8 @@ class FieldFloat(EarthFloat):
     def _own_error(self):
         """The field is what it was, and its heading is another, for restart_after: the attitude is wrong."""
         has, j, most = self.decided, self.j, max(1, self.pairs(STEADY_MOST))
-        self.steady = min(most, self.steady + j) if has & SAME else 0
+        # a turn that was not measured mixes two headings, for a moment
+        self.steady = min(most, self.steady + j) if has & SAME else max(0, self.steady - 2 * j)
         if self.reference is None or has & CONSISTENT:
             self.lost = max(0, self.lost - 2 * j)
             self.own = self.steady == most

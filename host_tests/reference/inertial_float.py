@@ -30,6 +30,8 @@ units, true roots and angles, and no rounding. Yes/no decisions are taken here, 
 # away by what is wrong with the bias about the vertical (u = third row of R):
 #     heading' = -u . bias + noise of (0.0006 rad)**2 + (scale_error |w|)**2 a second
 #     bias'    = noise of bias_walk**2 along u, bias_walk_level**2 across it, a second
+# bias_walk_far along u while |e| has been beyond the bound below, to one side, for far_after: the bias changes. And
+# only bias_walk across it while a rest contradicts the bias: who turns slowly and steadily changes no bias.
 # What is measured, with the variance that its mean over one second would have:
 #     compass       e = atan2(-west, north) of the mean field: the heading, mag_noise**2
 #     tilt, moving  -(turn_north, turn_west) / T = (y_north, y_west) . bias, tilt_noise**2 (1 + D)
@@ -42,17 +44,18 @@ units, true roots and angles, and no rounding. Yes/no decisions are taken here, 
 # with z = P row' and S = row z + variance.
 # After two blocks b takes up the bias's part of x, `turn` about up the heading's; the tilt is never touched.
 #
-# A start, a restart of the tilt, or a gyro at full scale make P(heading) larger again, as far as 3 rad**2: this part of
-# the error has nothing to do with the biases, and what the rest has in common with them stays. Where P(heading) would
-# grow beyond, P(heading, bias) shrinks as a heading scaled to 3 rad**2 has it. What contradicts the bias makes P(bias)
-# that of the start.
+# A start, a restart of the tilt, a gyro at full scale, a step without a sample (by what |w| may have turned it), or a
+# correction cut off at 1/2 rad (what is left is still to come) make P(heading) larger again, as far as 3 rad**2: this
+# part of the error has nothing to do with the biases, and what the rest has in common with them stays. Where
+# P(heading) would grow beyond, P(heading, bias) shrinks as a heading scaled to 3 rad**2 has it. What contradicts the
+# bias makes P(bias) that of the start.
 #
 # Field: the pair (horizontal, vertical) of the mean field, and e. It is believed while it is near the reference, and
-# |e| below field_gate + 1.125 doubt; at rest e stays where it was to 0.1 rad, too. Another field, or the same with
-# another heading, becomes the reference when it has stayed for long enough, counted while the body turns: field_first
-# for the first, field_new for one with the same heading, otherwise twice as long as the reference was seen, and 5 s;
-# 3 s for the reference before this one. A heading error that comes up while the field stays the same is the attitude's
-# own: after restart_after the heading starts again.
+# |e| below field_gate + 1.125 doubt, or the doubt above 1.5 rad; at rest, with a doubt below 0.3 rad, e stays where it
+# was to 0.1 rad, too. Another field, or the same with another heading, becomes the reference when it has stayed for
+# long enough, counted while the body turns: field_first for the first, field_new for one with the same heading,
+# otherwise twice as long as the reference was seen, and 5 s; 3 s for the reference before this one. A heading error
+# that comes up while the field stays the same is the attitude's own: after restart_after the heading starts again.
 
 import math
 
@@ -84,6 +87,8 @@ DEFAULTS = {
     "bias_start_dps": 4.0,
     "bias_walk": 0.003,
     "bias_walk_level": 0.0525,
+    "bias_walk_far": 0.03,
+    "far_after": 4.0,
     "tilt_noise": 2.8,
     "rest_noise": 0.05,
     "mag_noise": 0.26,
@@ -202,6 +207,8 @@ class InertialFloat(FieldFloat):
         self.full = self.clipped = 0
         self.n = self.lean = 0
         self.k_pace = self.T / self.p["tau_start"]
+        self.missed = self.far = 0
+        self.p_up = math.inf
         self.again = False
         self.level = 1
         self.s, self.lean_s = [0.0, 0.0, 1.0], [0.0, 0.0]
@@ -267,6 +274,8 @@ class InertialFloat(FieldFloat):
             self.again = True
             self.open_heading(OPEN)
             self._forget_sums()
+        else:
+            self.missed = min(self.missed + self.gap, max(1, self.steps(self.p["outage"])))
         self.gap = 0
         if counts[10] & 8:
             self.clipped += 1
@@ -443,13 +452,15 @@ class InertialFloat(FieldFloat):
             if abs(off[i]) > math.radians(self.p["rest_dps"])
             and self.P[1 + i][1 + i] < 5 * self.rest_noise
         ]
+        up = abs(sum(u * v for u, v in zip(self.R[2], off, strict=True)))
+        if up > math.radians(self.p["rest_dps"]) and self.p_up < 5 * self.rest_noise:
+            known.append(self.p_up)  # however the board is mounted
         if not self.decide(CONTRADICTS, bool(known)):
             self.wait = 0
             return n
         self.wait += 1
         if self.wait == 1:
             self.wait_e, self.wait_turn, self.wait_a = self.e, 0.0, self.low2[0:3]
-        up = abs(sum(u * v for u, v in zip(self.R[2], off, strict=True)))
         turn = min(up * self.wait * self.T2, TURN_MOST_SEEN)
         turned = sum((a - b) ** 2 for a, b in zip(self.low2, self.wait_a, strict=False))
         turned = turned > (WAIT_MOVED_G * self.lsb) ** 2
@@ -480,7 +491,7 @@ class InertialFloat(FieldFloat):
         return min(n, self.rest_after - 1)
 
     def _field_known(self):
-        return self.axes == 9 and self.reference is not None and self.since < 16
+        return self.axes == 9 and self.field is not None and self.since < 16
 
     def _patience(self, variance):
         """Blocks of rest that would give this variance."""
@@ -498,8 +509,13 @@ class InertialFloat(FieldFloat):
         for i in range(3):
             P[0][1 + i] -= T * v[i]
             P[1 + i][0] = P[0][1 + i]
+        self.p_up = u
         level = math.radians(p["bias_walk_level"]) ** 2 * T
         up = math.radians(p["bias_walk"]) ** 2 * T
+        if self.decided & CONTRADICTS:
+            level = up
+        if abs(self.far) > self.pairs(p["far_after"]):
+            up = math.radians(p["bias_walk_far"]) ** 2 * T
         for i in range(3):
             if P[1 + i][1 + i] >= start:
                 continue
@@ -510,16 +526,15 @@ class InertialFloat(FieldFloat):
                         x = min(start, x + level)
                     P[1 + i][1 + k] = P[1 + k][1 + i] = x
         x = P[0][0] - 2 * T * c + T * T * u + T * (WALK**2 + p["scale_error"] ** 2 * self.rate)
-        if self.clipped:
-            # a gyro at full scale may have missed as much again, at least 1000 deg/s
+        if self.clipped or self.missed:
+            # a gyro at full scale may have missed as much again, at least 1000 deg/s; a step without a sample all
             missed = self.clipped * max(32768 * self.gyro, math.radians(1000)) * self.dt
+            missed += self.missed * math.sqrt(self.held) * self.dt
             x = max(x, min(OPEN, (math.sqrt(P[0][0]) + missed) ** 2))
-            self.clipped = 0
+            self.clipped = self.missed = 0
         if x > OPEN:
-            over = (
-                x - OPEN
-            ) / 6.25  # in the integers' unit, (2.5 rad)**2; 1 / (2 OPEN) of it, and a little more
-            over = (int(over * 65536) + 1) / 65536 * 9 / 8
+            # 1 - (x - OPEN) / (2 OPEN), and a little more, in steps of the integers: (2.5 rad)**2 / 2**16
+            over = (int((x - OPEN) / 6.25 * 65536) + 1) / 65536 * 9 / 8
             x = OPEN
             for i in range(1, 4):
                 P[0][i] *= 1 - over
@@ -549,9 +564,21 @@ class InertialFloat(FieldFloat):
         if not (self.j and self.weight):
             return
         noise = self.p["mag_noise"] ** 2 / (self.j * self.T2)
-        noise *= max(1.0, abs(self.e) / (LIMIT + LIMIT_DOUBT * self.doubt))
+        beyond = abs(self.e) / (LIMIT + LIMIT_DOUBT * self.doubt)
+        noise *= max(1.0, beyond)
+        self._watch_heading(beyond > 1)
         late = self.n > self.steps(self.p["bias_after"])
         self._take([1, 0, 0, 0], self.e, noise, SHARE if late else 0.0)
+
+    def _watch_heading(self, beyond):
+        """FAR: for how long the heading has been off to the same side, by more than its doubt."""
+        if beyond:
+            step = self.j if self.e >= 0 else -self.j
+            self.far = step + (self.far if (self.far < 0) == (step < 0) else 0)
+        else:
+            self.far -= self.far // 4
+            if self.far > 0:
+                self.far -= 1
 
     def _measure_bias(self):
         """At rest the gyro's axes in turn, in motion the tilt correction north and west."""
@@ -583,6 +610,8 @@ class InertialFloat(FieldFloat):
         for i in range(3):
             self.b[i] = clamp(self.b[i] + self.dx[1 + i], limit)
         turn = self.turn[2] = clamp(self.dx[0], TURN_MOST)
+        if abs(self.dx[0]) > TURN_MOST:  # the rest of it is still to come
+            self.P[0][0], self.doubt = OPEN, math.sqrt(OPEN)
         self.dx = [0.0] * 4
         if abs(self.wait_turn + turn) < 2:
             self.wait_turn += turn

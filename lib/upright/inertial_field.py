@@ -14,42 +14,42 @@ _HEADING = const(75)  # Q28: heading error, rad
 _NOW = const(76)  # 2, Q13: horizontal and vertical field, counts
 _STILL = const(99)  # blocks without motion, no more than REST_AFTER
 _REST_AFTER = const(100)  # blocks
-_RATE = const(125)  # squared turn rate of the block, (4 counts)**2
-_P = const(190)  # 16, Q30: covariance of heading (2.5 rad) and bias (bias_start * 2**0.5), 4 x 4
-_HAVE = const(236)  # 1: field and candidate are set; 2: reference, too; 4: the one before, too
-_F = const(237)  # 2, Q13: smoothed field, counts, horizontal and vertical
-_FR = const(239)  # 2, Q13: reference; F, FR, FO and FC stand together
-_FO = const(241)  # 2, Q13: the reference before this one
-_FC = const(243)  # 2, Q13: candidate
-_NEAR = const(245)  # blocks near the reference, no more than FIELD_AFTER
-_FOR = const(246)  # blocks for which the reference was seen while turning
-_FOR_MOST = const(247)  # most of it
-_FO_FOR = const(248)  # the same of the reference before
-_CAND = const(249)  # the same of the candidate
-_BACK = const(250)  # blocks near the reference before
-_BACK_AFTER = const(251)  # blocks
-_CAND_E = const(252)  # Q28: heading error in the candidate's field, rad
-_STILL_E = const(253)  # Q28: slow mean of the heading error at rest, rad
-_STILL_SET = const(254)  # 1: it is set
-_STILL_K = const(255)  # Q15: its gain
-_STEADY = const(256)  # blocks with the field near to the reference, no more than STEADY_MOST
-_STEADY_MOST = const(257)  # blocks
-_OWN = const(258)  # 1: the heading error is the attitude's own, not another field's
-_LOST = const(259)  # half blocks of such an error
-_RESTART_AFTER = const(260)  # half blocks
-_WEIGHT = const(261)  # 1: the heading is taken up
-_TOL = const(262)  # Q15: tolerance squared
-_SAME = const(263)  # Q15: the same for a field that has not changed
-_SMOOTH = const(264)  # Q10: blocks of 0.05 s
-_REF = const(265)  # Q10: blocks of the reference's time constant
-_FIELD_AFTER = const(266)  # blocks
-_FIELD_FIRST = const(267)  # blocks
-_FIELD_NEW = const(268)  # blocks
-_NEED = const(269)  # blocks of 5 s
-_TURNING_MIN = const(270)  # squared turn rate, (4 counts)**2
-_GATE = const(271)  # Q28: heading error that is believed, beside the doubt, rad
-_GOOD = const(272)  # 1: the field is the reference's, and its heading is believed
-_DOUBT = const(273)  # Q28: heading uncertainty, rad
+_RATE = const(127)  # squared turn rate of the block, (4 counts)**2
+_P = const(192)  # 16, Q30: covariance of heading (2.5 rad) and bias (bias_start * 2**0.5), 4 x 4
+_HAVE = const(242)  # 1: field and candidate are set; 2: reference, too; 4: the one before, too
+_F = const(243)  # 2, Q13: smoothed field, counts, horizontal and vertical
+_FR = const(245)  # 2, Q13: reference; F, FR, FO and FC stand together
+_FO = const(247)  # 2, Q13: the reference before this one
+_FC = const(249)  # 2, Q13: candidate
+_NEAR = const(251)  # blocks near the reference, no more than FIELD_AFTER
+_FOR = const(252)  # blocks for which the reference was seen while turning
+_FOR_MOST = const(253)  # most of it
+_FO_FOR = const(254)  # the same of the reference before
+_CAND = const(255)  # the same of the candidate
+_BACK = const(256)  # blocks near the reference before
+_BACK_AFTER = const(257)  # blocks
+_CAND_E = const(258)  # Q28: heading error in the candidate's field, rad
+_STILL_E = const(259)  # Q28: slow mean of the heading error at rest, rad
+_STILL_SET = const(260)  # 1: it is set
+_STILL_K = const(261)  # Q15: its gain
+_STEADY = const(262)  # blocks with the field near to the reference, no more than STEADY_MOST
+_STEADY_MOST = const(263)  # blocks
+_OWN = const(264)  # 1: the heading error is the attitude's own, not another field's
+_LOST = const(265)  # half blocks of such an error
+_RESTART_AFTER = const(266)  # half blocks
+_WEIGHT = const(267)  # 1: the heading is taken up
+_TOL = const(268)  # Q15: tolerance squared
+_SAME = const(269)  # Q15: the same for a field that has not changed
+_SMOOTH = const(270)  # Q10: blocks of 0.05 s
+_REF = const(271)  # Q10: blocks of the reference's time constant
+_FIELD_AFTER = const(272)  # blocks
+_FIELD_FIRST = const(273)  # blocks
+_FIELD_NEW = const(274)  # blocks
+_NEED = const(275)  # blocks of 5 s
+_TURNING_MIN = const(276)  # squared turn rate, (4 counts)**2
+_GATE = const(277)  # Q28: heading error that is believed, beside the doubt, rad
+_GOOD = const(278)  # 1: the field is the reference's, and its heading is believed
+_DOUBT = const(279)  # Q28: heading uncertainty, rad
 # -- end of the words
 
 # decisions
@@ -64,6 +64,8 @@ _FORGET = const(8192)
 _PI28 = const(843314857)  # pi, Q28
 _FORGOTTEN = const(51539608)  # 0.3 rad**2 in units of (2.5 rad)**2, Q30
 _TENTH = const(26843546)  # 0.1 rad, Q28
+_SURE = const(80530637)  # 0.3 rad, Q28
+_ANY = const(402653184)  # 1.5 rad, Q28: any heading is as likely
 _CAND_TOL = const(93952410)  # 0.35 rad, Q28
 
 
@@ -141,9 +143,9 @@ def smooth_field(s: ptr32):
     if x < 0:
         x = 0 - x
     doubt = s[_DOUBT]
-    if x - s[_GATE] < doubt + (doubt >> 3):
+    if x - s[_GATE] < doubt + (doubt >> 3) or doubt > _ANY:
         bits |= _CONSISTENT
-        if have & 2 and s[_STILL_SET] and s[_STILL] == s[_REST_AFTER]:
+        if have & 2 and s[_STILL_SET] and s[_STILL] == s[_REST_AFTER] and doubt < _SURE:
             x = e - (s[_STILL_E] << k >> k)
             if x < 0:
                 x = 0 - x
@@ -236,11 +238,14 @@ def judge_field(state):
             x = x + _PI28 + _PI28
         s[_CAND_E] = x
     # own: the field is what it was, and its heading is another: the attitude is wrong
-    steady = 0
-    if bits & _SAME_BIT:
-        steady = s[_STEADY] + j
-        if steady > s[_STEADY_MOST]:
-            steady = s[_STEADY_MOST]
+    steady = s[_STEADY] + j
+    if bits & _SAME_BIT == 0:
+        # a turn that was not measured mixes two headings, for a moment
+        steady -= 3 * j
+        if steady < 0:
+            steady = 0
+    elif steady > s[_STEADY_MOST]:
+        steady = s[_STEADY_MOST]
     s[_STEADY] = steady
     lost = s[_LOST]
     own = s[_OWN]
@@ -326,7 +331,7 @@ def judge_field(state):
     # the heading error at rest, slowly
     if good or s[_HAVE] & 2 == 0:
         x = e - (s[_STILL_E] << k >> k)
-        if s[_STILL_SET] == 0 or s[_STILL] < s[_REST_AFTER]:
+        if s[_STILL_SET] == 0 or s[_STILL] < s[_REST_AFTER] or s[_DOUBT] >= _SURE:
             s[_STILL_SET] = 1
             s[_STILL_E] = e
         else:

@@ -16,6 +16,7 @@ _O_BASE = const(52)  # 3, Q31: O of BASE alone
 _OR_BASE = const(55)  # 3, Q46: its last bits
 _B = const(58)  # 3: learnt bias on top of BASE, in the filter's own unit
 _BLOCK = const(62)  # log2 of the steps of a block
+_DECIDED = const(65)  # yes/no decisions, for the tests' float twin
 _J = const(74)  # blocks that the heading of this block stands for; 0: none
 _HEADING = const(75)  # Q28: heading error, rad
 _LOW2 = const(90)  # 6, Q12: second
@@ -24,46 +25,59 @@ _REST_AFTER = const(100)  # blocks
 _LEVEL = const(106)  # log2 of the steps of a levelling: 0 at the start, BLOCK in the end
 _CLIPPED = const(116)  # samples with one since P grew last
 _CLIP = const(117)  # Q15: what one adds to the doubt of the heading, units of 2.5 rad
-_RATE = const(125)  # squared turn rate of the block, (4 counts)**2
-_N = const(144)  # steps since the start of the ramp, no more than N_END
-_N_LATE = const(145)  # steps until the bias is estimated in motion
-_N_FULL = const(146)  # steps until it is at full weight
-_Y = const(164)  # 6, Q24: outer low-pass
-_OM = const(171)  # Q15: tilt confidence 1 / (1 + D)
-_WAIT_TURN = const(180)  # Q28: corrections of the heading since, rad
-_B_SHIFT = const(186)  # B is in counts, Q(B_SHIFT)
-_B_MAX = const(187)  # its bound
-_B_UNIT = const(188)  # the unit of P's biases in B's, / 2**13
-_B_INVERSE = const(189)  # 2**20 counts / this unit
-_P = const(190)  # 16, Q30: covariance of heading (2.5 rad) and bias (bias_start * 2**0.5), 4 x 4
-_DX = const(206)  # 4, Q27: their correction in these two blocks
-_INNOVATION = const(210)  # Q27: what is measured of ROW . (heading, bias), less what DX says ...
-_NOISE = const(211)  # Q20: ... its variance ...
-_Z = const(212)  # 4, Q30: ... P ROW ...
-_TOTAL = const(216)  # Q30: ... and ROW P ROW
-_Q_HEADING = const(221)  # Q30: variance that two blocks add to the heading ...
-_Q_SCALE = const(222)  # ... and for RATE: Q_SCALE / 2**Q_SCALE_SHIFT
-_Q_SCALE_SHIFT = const(223)
-_Q_LEVEL = const(224)  # Q30: variance that two blocks add to a horizontal bias ...
-_Q_UP = const(225)  # Q30: ... and to a vertical one
-_GROW = const(226)  # Q20: heading that a unit of bias makes in two blocks
-_R_TILT = const(227)  # Q20: variance of a tilt correction as a bias
-_R_REST = const(228)  # Q20: variance of the gyro at rest
-_R_MAG = const(229)  # Q20: variance of a heading
-_SHARE = const(230)  # Q15: how much of what the measurement says of the bias is believed
-_AXIS = const(231)  # of the gyro that was measured last, at rest
-_SIDE = const(232)  # which tilt correction comes next: 0 north, 1 west
-_CC = const(233)  # TURN to INNOVATION: CC / 2**10
-_C = const(234)  # 2, Q31: TURN of the last levelling, north and west
-_STILL_E = const(253)  # Q28: slow mean of the heading error at rest, rad
-_STILL_SET = const(254)  # 1: it is set
-_WEIGHT = const(261)  # 1: the heading is taken up
-_DOUBT = const(273)  # Q28: heading uncertainty, rad
+_MISSED = const(118)  # steps without a sample since P grew last
+_MISS = const(119)  # Q28: what one of them adds for 4 counts of HELD's root, units of 2.5 rad
+_RATE = const(127)  # squared turn rate of the block, (4 counts)**2
+_HELD = const(128)  # the same: follows up at once and down slowly
+_N = const(146)  # steps since the start of the ramp, no more than N_END
+_N_LATE = const(147)  # steps until the bias is estimated in motion
+_N_FULL = const(148)  # steps until it is at full weight
+_Y = const(166)  # 6, Q24: outer low-pass
+_OM = const(173)  # Q15: tilt confidence 1 / (1 + D)
+_WAIT_TURN = const(182)  # Q28: corrections of the heading since, rad
+_B_SHIFT = const(188)  # B is in counts, Q(B_SHIFT)
+_B_MAX = const(189)  # its bound
+_B_UNIT = const(190)  # the unit of P's biases in B's, / 2**13
+_B_INVERSE = const(191)  # 2**20 counts / this unit
+_P = const(192)  # 16, Q30: covariance of heading (2.5 rad) and bias (bias_start * 2**0.5), 4 x 4
+_DX = const(208)  # 4, Q27: their correction in these two blocks
+_INNOVATION = const(212)  # Q27: what is measured of ROW . (heading, bias), less what DX says ...
+_NOISE = const(213)  # Q20: ... its variance ...
+_Z = const(214)  # 4, Q30: ... P ROW ...
+_TOTAL = const(218)  # Q30: ... and ROW P ROW
+_P_UP = const(222)  # Q30: variance of the bias about the vertical
+_Q_HEADING = const(224)  # Q30: variance that two blocks add to the heading ...
+_Q_SCALE = const(225)  # ... and for RATE: Q_SCALE / 2**Q_SCALE_SHIFT
+_Q_SCALE_SHIFT = const(226)
+_Q_LEVEL = const(227)  # Q30: variance that two blocks add to a horizontal bias ...
+_Q_UP = const(228)  # Q30: ... and to a vertical one
+_Q_FAR = const(229)  # Q30: ... the same while the heading stays far off
+_GROW = const(230)  # Q20: heading that a unit of bias makes in two blocks
+_R_TILT = const(231)  # Q20: variance of a tilt correction as a bias
+_R_REST = const(232)  # Q20: variance of the gyro at rest
+_R_MAG = const(233)  # Q20: variance of a heading
+_FAR = const(
+    234
+)  # blocks for which the heading has been off by more than its doubt, to the left; < 0: to the right
+_FAR_AFTER = const(235)  # blocks after which the vertical bias is taken to change
+_SHARE = const(236)  # Q15: how much of what the measurement says of the bias is believed
+_AXIS = const(237)  # of the gyro that was measured last, at rest
+_SIDE = const(238)  # which tilt correction comes next: 0 north, 1 west
+_CC = const(239)  # TURN to INNOVATION: CC / 2**10
+_C = const(240)  # 2, Q31: TURN of the last levelling, north and west
+_STILL_E = const(259)  # Q28: slow mean of the heading error at rest, rad
+_STILL_SET = const(260)  # 1: it is set
+_WEIGHT = const(267)  # 1: the heading is taken up
+_DOUBT = const(279)  # Q28: heading uncertainty, rad
 # -- end of the words
+
+# decisions
+_CONTRADICTS = const(256)
 
 _PI28 = const(843314857)  # pi, Q28
 _HALF = const(536870912)  # 1/2, Q30: no variance is more
 _OPEN = const(515396076)  # 3 rad**2 in units of (2.5 rad)**2, Q30: nothing is known of the heading
+_OPEN_DOUBT = const(464936960)  # its root, Q28: rad
 _LIMIT = const(5368709)  # 0.02 rad, Q28
 _LEAST = const(64)  # Q30: no variance is less
 _HEADING_SHARE = const(7200)  # 0.22, Q15: the magnetometer's errors last, and are not noise alone
@@ -120,8 +134,15 @@ def grow(s: ptr32):
     a = s[_R + 6] << k >> k
     b = s[_R + 7] << k >> k
     o = s[_R + 8] << k >> k
-    # the biases walk by so much more about the vertical
-    walk = (s[_Q_UP] - s[_Q_LEVEL]) << k >> k
+    # the biases walk by so much more about the vertical; a heading that stays off shows that this one does
+    level = s[_Q_LEVEL]
+    if s[_DECIDED] & _CONTRADICTS:
+        level = s[_Q_UP]
+    walk = s[_Q_UP]
+    c = s[_FAR] << k >> k
+    if c > s[_FAR_AFTER] or c < 0 - s[_FAR_AFTER]:
+        walk = s[_Q_FAR]
+    walk -= level
     c = 0
     u = 0
     y = a
@@ -156,7 +177,7 @@ def grow(s: ptr32):
                 if s[_P + 5 * n] < _HALF:
                     v = (s[at + n] << k >> k) + (m * x >> 15)
                     if n == i:
-                        v += s[_Q_LEVEL]
+                        v += level
                         if v > _HALF:
                             v = _HALF
                     s[at + n] = v
@@ -169,6 +190,7 @@ def grow(s: ptr32):
         y = b
         if i == 3:
             y = o
+    s[_P_UP] = u
     # P(heading, heading) += g (g u - 2 c) + walk + scale_error RATE
     m = u >> 15
     u = m * gain + ((u - (m << 15)) * gain >> 15) >> 5
@@ -180,10 +202,12 @@ def grow(s: ptr32):
     n -= m << 14
     y = s[_Q_SCALE]
     x = s[_P] + u + s[_Q_HEADING] + (m * y + (n * y >> 14) >> s[_Q_SCALE_SHIFT])
-    if s[_CLIPPED]:
-        # what a gyro at full scale may have missed
+    if s[_CLIPPED] | s[_MISSED]:
+        # what a gyro at full scale may have missed, and what steps without a sample
         y = int(root(s[_P])) + s[_CLIPPED] * s[_CLIP]
+        y += (int(root(s[_HELD])) * s[_MISSED] >> 7) * s[_MISS] >> 6
         s[_CLIPPED] = 0
+        s[_MISSED] = 0
         if y > 22702:
             y = 22702
         if y * y > x:
@@ -354,8 +378,21 @@ def measure_heading(s: ptr32) -> int:
     x = e
     if x < 0:
         x = 0 - x
+    n = s[_FAR] << k >> k
     if x > most:
         s[_NOISE] = (s[_NOISE] >> 5) * ((x >> 4) // (most >> 12)) >> 3
+        if e < 0:
+            j = 0 - j
+        # a change of side begins anew
+        if (n ^ j) < 0:
+            n = 0
+        if n < 0xFFFF and n > 0 - 0xFFFF:
+            n += j
+    else:
+        n -= n >> 2
+        if n > 0:
+            n -= 1
+    s[_FAR] = n
     s[_INNOVATION] = e // 5 - (s[_DX] << k >> k)  # units of 2.5 rad, Q27
     s[_Z] = s[_P]
     s[_Z + 1] = s[_P + 1]
@@ -494,10 +531,14 @@ def apply(s: ptr32):
         n += 1
     # the heading, no more than 1/2 rad in two blocks
     x = s[_DX] << k >> k
-    if x > 0x1999999:
-        x = 0x1999999
-    elif x < 0 - 0x1999999:
-        x = 0 - 0x1999999
+    if x > 0x1999999 or x < 0 - 0x1999999:
+        # the rest of it is still to come
+        s[_P] = _OPEN
+        s[_DOUBT] = _OPEN_DOUBT
+        if x > 0:
+            x = 0x1999999
+        else:
+            x = 0 - 0x1999999
     n = 0
     while n < 4:
         s[_DX + n] = 0

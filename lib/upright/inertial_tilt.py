@@ -40,59 +40,60 @@ _LEVEL_MASK = const(107)  # steps of it less 1
 _REGRESS = const(108)  # 1: the regressors take their step next
 _PART = const(109)  # part of the work of two blocks that comes next
 _GG = const(111)  # 3: gyro counts summed over two blocks
-_SEEN = const(119)  # 3, Q12: the gyro of one sample, less BASE
-_H = const(122)  # 3, Q14: specific force of the block in the earth frame, counts
-_RATE = const(125)  # squared turn rate of the block, (4 counts)**2
-_HELD = const(126)  # the same: follows up at once and down slowly
-_HELD_K = const(127)  # Q15: gain down
-_S = const(128)  # 3, Q14: low-passed specific force in the earth frame, counts
-_OFF = const(131)  # 2, Q14: the block's force less the low-pass, horizontal, counts
-_SF = const(133)  # 2, Q14: the force low-passed quickly, horizontal, counts
-_SF_K = const(135)  # Q15: gain of it
-_LEAN_G = const(136)  # |SF| beyond which the tilt is lost: (4 counts)**2
-_LEAN = const(137)  # blocks with more
-_LEAN_AFTER = const(138)  # blocks
-_K = const(139)  # tilt gain of this levelling = K / 2**K_SHIFT, K < 2**15
-_K_SHIFT = const(140)
-_KC = const(141)  # the same for S (normalised) to half angle
-_KC_SHIFT = const(142)
-_AGAIN = const(143)  # 1: the ramp starts anew
-_N = const(144)  # steps since the start of the ramp, no more than N_END
-_N_END = const(147)  # steps after which the start is over
-_RAMP = const(148)  # Q8: ramp of the tilt
-_K_PACE = const(149)  # Q20: tilt gain of a block after the start
-_K_START = const(150)  # Q20: tilt gain of a block while little is known of the bias ...
-_K_LEAST = const(151)  # Q20: ... and its bounds afterwards
-_K_MOST = const(152)  # Q20
-_K_TURN = const(153)  # tilt gain for the fourth root of HELD: K_TURN / 2**22
-_NORM = const(154)  # shift that brings 1 g to 2**14..2**15 counts
-_G1 = const(155)  # 1 g in counts
-_LI = const(156)  # Q29: 1 / (1 g, normalised)
-_OM_GAIN = const(157)  # Q24: 1 / (accel_doubt, normalised)
-_X = const(158)  # 6, Q24: regressors north and west: inner low-pass
-_Y = const(164)  # 6, Q24: outer low-pass
-_D = const(170)  # Q15: square of the horizontal deviation / accel_doubt**2
-_OM = const(171)  # Q15: tilt confidence 1 / (1 + D)
-_REST_OFF = const(172)  # Q12: most that a known bias may be off, counts
-_UPSET = const(173)  # tilt at rest that restarts the ramp: (counts / 4)**2
-_JUMP = const(174)  # Q12: a bias found at rest that restarts the ramp, counts
-_SOON = const(175)  # steps after a restart in which no other follows
-_WAIT = const(176)  # blocks for which a rest has contradicted the bias
-_WAIT_MOST = const(177)  # blocks
-_WAIT_SURE = const(178)  # blocks after which a slow turn is decided, too
-_WAIT_E = const(179)  # Q28: the heading error at their start, rad
-_WAIT_TURN = const(180)  # Q28: corrections of the heading since, rad
-_WAIT_A = const(181)  # 3, Q12: accelerometer at their start, counts
-_WAIT_MOVED = const(184)  # how far it may be from there: counts**2 / 16
-_GYRO = const(185)  # Q28: the angle of a count in two blocks, rad
-_B_SHIFT = const(186)  # B is in counts, Q(B_SHIFT)
-_P = const(190)  # 16, Q30: covariance of heading (2.5 rad) and bias (bias_start * 2**0.5), 4 x 4
-_DX = const(206)  # 4, Q27: their correction in these two blocks
-_P_REST = const(217)  # Q30: variance of a bias after two blocks of rest
-_P_KNOWN = const(218)  # Q30: variance of a bias that is known ...
-_P_VAGUE = const(219)  # Q30: ... and of one of which little is known
-_C = const(234)  # 2, Q31: TURN of the last levelling, north and west
-_HAVE = const(236)  # 1: field and candidate are set; 2: reference, too; 4: the one before, too
+_SEEN = const(121)  # 3, Q12: the gyro of one sample, less BASE
+_H = const(124)  # 3, Q14: specific force of the block in the earth frame, counts
+_RATE = const(127)  # squared turn rate of the block, (4 counts)**2
+_HELD = const(128)  # the same: follows up at once and down slowly
+_HELD_K = const(129)  # Q15: gain down
+_S = const(130)  # 3, Q14: low-passed specific force in the earth frame, counts
+_OFF = const(133)  # 2, Q14: the block's force less the low-pass, horizontal, counts
+_SF = const(135)  # 2, Q14: the force low-passed quickly, horizontal, counts
+_SF_K = const(137)  # Q15: gain of it
+_LEAN_G = const(138)  # |SF| beyond which the tilt is lost: (4 counts)**2
+_LEAN = const(139)  # blocks with more
+_LEAN_AFTER = const(140)  # blocks
+_K = const(141)  # tilt gain of this levelling = K / 2**K_SHIFT, K < 2**15
+_K_SHIFT = const(142)
+_KC = const(143)  # the same for S (normalised) to half angle
+_KC_SHIFT = const(144)
+_AGAIN = const(145)  # 1: the ramp starts anew
+_N = const(146)  # steps since the start of the ramp, no more than N_END
+_N_END = const(149)  # steps after which the start is over
+_RAMP = const(150)  # Q8: ramp of the tilt
+_K_PACE = const(151)  # Q20: tilt gain of a block after the start
+_K_START = const(152)  # Q20: tilt gain of a block while little is known of the bias ...
+_K_LEAST = const(153)  # Q20: ... and its bounds afterwards
+_K_MOST = const(154)  # Q20
+_K_TURN = const(155)  # tilt gain for the fourth root of HELD: K_TURN / 2**22
+_NORM = const(156)  # shift that brings 1 g to 2**14..2**15 counts
+_G1 = const(157)  # 1 g in counts
+_LI = const(158)  # Q29: 1 / (1 g, normalised)
+_OM_GAIN = const(159)  # Q24: 1 / (accel_doubt, normalised)
+_X = const(160)  # 6, Q24: regressors north and west: inner low-pass
+_Y = const(166)  # 6, Q24: outer low-pass
+_D = const(172)  # Q15: square of the horizontal deviation / accel_doubt**2
+_OM = const(173)  # Q15: tilt confidence 1 / (1 + D)
+_REST_OFF = const(174)  # Q12: most that a known bias may be off, counts
+_UPSET = const(175)  # tilt at rest that restarts the ramp: (counts / 4)**2
+_JUMP = const(176)  # Q12: a bias found at rest that restarts the ramp, counts
+_SOON = const(177)  # steps after a restart in which no other follows
+_WAIT = const(178)  # blocks for which a rest has contradicted the bias
+_WAIT_MOST = const(179)  # blocks
+_WAIT_SURE = const(180)  # blocks after which a slow turn is decided, too
+_WAIT_E = const(181)  # Q28: the heading error at their start, rad
+_WAIT_TURN = const(182)  # Q28: corrections of the heading since, rad
+_WAIT_A = const(183)  # 3, Q12: accelerometer at their start, counts
+_WAIT_MOVED = const(186)  # how far it may be from there: counts**2 / 16
+_GYRO = const(187)  # Q28: the angle of a count in two blocks, rad
+_B_SHIFT = const(188)  # B is in counts, Q(B_SHIFT)
+_P = const(192)  # 16, Q30: covariance of heading (2.5 rad) and bias (bias_start * 2**0.5), 4 x 4
+_DX = const(208)  # 4, Q27: their correction in these two blocks
+_P_REST = const(219)  # Q30: variance of a bias after two blocks of rest
+_P_KNOWN = const(220)  # Q30: variance of a bias that is known ...
+_P_VAGUE = const(221)  # Q30: ... and of one of which little is known
+_P_UP = const(222)  # Q30: variance of the bias about the vertical
+_C = const(240)  # 2, Q31: TURN of the last levelling, north and west
+_HAVE = const(242)  # 1: field and candidate are set; 2: reference, too; 4: the one before, too
 # -- end of the words
 
 # decisions
@@ -446,6 +447,13 @@ def detect_rest(state):
             if x < known:
                 known = x
         i += 1
+    # about the vertical, however the board is mounted
+    if up < 0:
+        up = 0 - up
+    if up > s[_REST_OFF] and s[_P_UP] < s[_P_KNOWN]:
+        contradicts = True
+        if s[_P_UP] < known:
+            known = s[_P_UP]
     decided = s[_DECIDED]
     x = _STILL_BIT | _UPSET_BIT | _CONTRADICTS | _ADOPT | _TURNED | _JUMPED
     decided = (decided | x) ^ x
@@ -483,15 +491,13 @@ def detect_rest(state):
                 x = s[_REST_AFTER]
             turn = 0
             field = 0
-            if s[_NINE] and s[_HAVE] & 2 and s[_SINCE] < 16:
+            if s[_NINE] and s[_HAVE] and s[_SINCE] < 16:
                 field = 1
             near = decided & (_NEAR_REFERENCE | _NEAR_CANDIDATE)
             if moved > s[_WAIT_MOVED]:
                 decided |= _TURNED
             elif wait >= x and (field == 0 or near or wait >= s[_WAIT_MOST]):
                 # turn: what the gyro less B would have turned the heading by; the magnetometer knows better
-                if up < 0:
-                    up = 0 - up
                 turn = (up >> 8) * wait
                 i = 0x3FFFFFFF // s[_GYRO]
                 if turn > i:

@@ -142,6 +142,8 @@ FULL         1  -    samples in a row with a gyro axis at full scale, no more th
 CLIPS        1  -    samples with one, no more than 2**30 - 1
 CLIPPED      1  -    samples with one since P grew last
 CLIP         1  Q15  what one adds to the doubt of the heading, units of 2.5 rad
+MISSED       1  -    steps without a sample since P grew last
+MISS         1  Q28  what one of them adds for 4 counts of HELD's root, units of 2.5 rad
 OUTAGE       1  -    steps without a fresh sample after which the tilt starts again
 SEEN         3  Q12  the gyro of one sample, less BASE
 H            3  Q14  specific force of the block in the earth frame, counts
@@ -203,16 +205,20 @@ TOTAL        1  Q30  ... and ROW P ROW
 P_REST       1  Q30  variance of a bias after two blocks of rest
 P_KNOWN      1  Q30  variance of a bias that is known ...
 P_VAGUE      1  Q30  ... and of one of which little is known
+P_UP         1  Q30  variance of the bias about the vertical
 P_SET        1  Q30  variance of a bias that was set with known_s = 1
 Q_HEADING    1  Q30  variance that two blocks add to the heading ...
 Q_SCALE      1  -    ... and for RATE: Q_SCALE / 2**Q_SCALE_SHIFT
 Q_SCALE_SHIFT 1 -
 Q_LEVEL      1  Q30  variance that two blocks add to a horizontal bias ...
 Q_UP         1  Q30  ... and to a vertical one
+Q_FAR        1  Q30  ... the same while the heading stays far off
 GROW         1  Q20  heading that a unit of bias makes in two blocks
 R_TILT       1  Q20  variance of a tilt correction as a bias
 R_REST       1  Q20  variance of the gyro at rest
 R_MAG        1  Q20  variance of a heading
+FAR          1  -    blocks for which the heading has been off by more than its doubt, to the left; < 0: to the right
+FAR_AFTER    1  -    blocks after which the vertical bias is taken to change
 SHARE        1  Q15  how much of what the measurement says of the bias is believed
 AXIS         1  -    of the gyro that was measured last, at rest
 SIDE         1  -    which tilt correction comes next: 0 north, 1 west
