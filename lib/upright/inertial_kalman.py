@@ -56,9 +56,7 @@ _GROW = const(230)  # Q20: heading that a unit of bias makes in two blocks
 _R_TILT = const(231)  # Q20: variance of a tilt correction as a bias
 _R_REST = const(232)  # Q20: variance of the gyro at rest
 _R_MAG = const(233)  # Q20: variance of a heading
-_FAR = const(
-    234
-)  # blocks with the heading off to the left by more than its doubt; < 0: to the right
+_FAR = const(234)  # blocks with the heading off by more than its doubt; the sign: to where
 _FAR_AFTER = const(235)  # blocks after which the vertical bias is taken to change
 _SHARE = const(236)  # Q15: how much of what the measurement says of the bias is believed
 _AXIS = const(237)  # of the gyro that was measured last, at rest

@@ -217,7 +217,7 @@ GROW         1  Q20  heading that a unit of bias makes in two blocks
 R_TILT       1  Q20  variance of a tilt correction as a bias
 R_REST       1  Q20  variance of the gyro at rest
 R_MAG        1  Q20  variance of a heading
-FAR          1  -    blocks with the heading off to the left by more than its doubt; < 0: to the right
+FAR          1  -    blocks with the heading off by more than its doubt; the sign: to where
 FAR_AFTER    1  -    blocks after which the vertical bias is taken to change
 SHARE        1  Q15  how much of what the measurement says of the bias is believed
 AXIS         1  -    of the gyro that was measured last, at rest
