@@ -123,3 +123,36 @@ def test_variables_are_numbered_as_the_compiler_meets_them():
     )
     (function,) = ast.parse(text).body
     assert in_registers(function) == ["a", "e", "b"]
+
+
+def passed_on(text):
+    """Pointers that a viper function hands to another function: "function, line: call"."""
+    found = []
+    for function in filter(_is_viper, ast.walk(ast.parse(text))):
+        kinds = pointers(function)
+        kinds = {name for name, kind in kinds.items() if kind.startswith("ptr")}
+        for node in ast.walk(function):
+            if (
+                isinstance(node, ast.Call)
+                and getattr(node.func, "id", "") not in ("ptr8", "ptr16", "ptr32", "int", "uint")
+                and kinds & {getattr(argument, "id", "") for argument in node.args}
+            ):
+                found.append(f"{function.name}, line {node.lineno}: {ast.unparse(node)}")
+    return found
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_no_pointer_is_passed_on(file):
+    """It would become an int, which is allocated where the heap lies above 2**30: on rv32, in some boards' SDRAM."""
+    assert passed_on(file.read_text("utf-8")) == []
+
+
+def test_a_pointer_that_is_passed_on_is_noticed():
+    head = "import micropython\n@micropython.viper\n"
+    wrong = head + "def f(s: ptr32):\n    g(s, 1)\n"
+    right = (
+        head
+        + "def f(state, n: int):\n    s = ptr32(state)\n    g(state, n)\n    s[0] = int(s[1])\n"
+    )
+    assert [said.split(": ")[1] for said in passed_on(wrong)] == ["g(s, 1)"]
+    assert passed_on(right) == []
