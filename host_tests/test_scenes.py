@@ -28,7 +28,7 @@ def hold(name, axes, kind="inertial"):
         assert value <= SCENES[name].limit(axes, figure), figure
 
 
-@pytest.mark.parametrize("name, axes", cases())
+@pytest.mark.parametrize("name, axes", list(cases()))
 def test_a_scene_stays_within_its_limits(name, axes):
     hold(name, axes)
 
