@@ -295,6 +295,7 @@ def test_with_random_plans_driver_and_tick_are_within_the_bounds(drive, data, ri
 
 
 @pytest.mark.slow
+@pytest.mark.xfail(reason="six axes: see What falls short in docs/reliability.md")
 @RANDOM
 @hypothesis.given(plan=plans("timer"))
 def test_with_random_plans_the_default_filter_is_within_the_bounds(plan, rig):
