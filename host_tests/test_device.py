@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 import serial
 from mpremote.transport import TransportError, TransportExecError
-from upright_host import contents, device, flash, rp2040, runtimes
+from upright_host import build_root, contents, device, flash, rp2040, runtimes
 from upright_host.console import Wrong
 
 FACTS = device.Facts("rp2", "Pico", (1, 26, 1), 6, 3, "armv6m", True, False, True, True, 900000)
@@ -175,11 +175,11 @@ def test_an_emulated_board_that_cannot_be_built_here_is_answered_with_a_finished
     upright, tmp_path, monkeypatch
 ):
     def expired(*command, **more):
-        raise rp2040.AptError("apt-get update: E: The repository is no longer signed")
+        raise build_root.AptError("apt-get update: E: The repository is no longer signed")
 
     monkeypatch.delenv(rp2040.VARIABLE, raising=False)
     monkeypatch.setenv("UPRIGHT_CACHE", str(tmp_path))
-    monkeypatch.setattr(rp2040.Apt, "run", expired)
+    monkeypatch.setattr(build_root.Apt, "run", expired)
     done = upright("flash", "pico", "--emulated")
     assert done.exit_code == 3
     assert "no longer signed" in done.stderr

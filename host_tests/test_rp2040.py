@@ -614,8 +614,11 @@ application.run()
 """
 
 
-def test_the_watchdog_lets_a_healthy_run_be_and_resets_a_board_whose_step_hangs(image):
+@pytest.mark.soak
+def test_the_watchdog_lets_a_healthy_run_be_and_resets_a_board_whose_step_hangs(image, soaking):
     """After 1.2 s, more than the time-out, the control loop never returns to the program."""
+    if not soaking:
+        pytest.skip("minutes on the emulated board: `make soak` runs it")
     settings = "WATCHDOG_MS = 1000\nMEASURE_BIAS = False\nFILTER = 'mahony6'\n"
     files = emulated.project("pico", settings)
     files["main.py"] = HANGS
