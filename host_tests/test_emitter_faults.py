@@ -8,6 +8,7 @@ from upright_host import paths
 
 FILES = sorted([*paths.PACKAGE.glob("*.py"), *paths.FIRMWARE.rglob("*.py")])
 IN_REGISTERS = 3  # MAX_REGS_FOR_LOCAL_VARS of py/emitnative.c, on every processor but x86
+POINTERS = ["", "ptr8", "ptr16", "ptr32"]  # the widest last
 WIDE = ("ptr16", "ptr32")  # an index of these is shifted; that of a ptr8 is not
 
 
@@ -21,7 +22,7 @@ def mentions(node):
     elif isinstance(node, ast.AnnAssign):
         parts = [node.value, node.target]
     elif isinstance(node, ast.While):
-        parts = [*node.body, node.test]
+        parts = [*node.body, node.test, *node.orelse]
     elif isinstance(node, ast.For):
         ranged = isinstance(node.iter, ast.Call) and getattr(node.iter.func, "id", "") == "range"
         first = reversed(node.iter.args) if ranged else [node.iter]
@@ -50,21 +51,61 @@ def in_registers(function):
     return [*found][:IN_REGISTERS]
 
 
+def bare(node):
+    """The expression without what the compiler passes through: int(), uint(), +, :=."""
+    while True:
+        if isinstance(node, ast.NamedExpr):
+            node = node.target
+        elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.UAdd):
+            node = node.operand
+        elif isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("int", "uint"):
+            node = node.args[0]
+        else:
+            return node
+
+
+def kind_of(node, kinds):
+    """ "ptr8", "ptr16" or "ptr32", the widest that an expression may be; "" for what is no pointer."""
+    node = bare(node)
+    if isinstance(node, ast.IfExp):
+        return max(kind_of(node.body, kinds), kind_of(node.orelse, kinds), key=POINTERS.index)
+    name = getattr(node.func if isinstance(node, ast.Call) else node, "id", "")
+    if isinstance(node, ast.Call):
+        return name if name in POINTERS else ""
+    return kinds.get(name, "")
+
+
+def assigned(function):
+    """(name, value) of every assignment, those of tuples one by one."""
+    for node in ast.walk(function):
+        if isinstance(node, ast.Assign):
+            targets, value = node.targets, node.value
+        elif isinstance(node, ast.AnnAssign | ast.NamedExpr) and node.value is not None:
+            targets, value = [node.target], node.value
+        else:
+            continue
+        for target in targets:
+            pairs = [(target, value)]
+            if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple):
+                pairs = zip(target.elts, value.elts, strict=True)
+            yield from ((t.id, v) for t, v in pairs if isinstance(t, ast.Name))
+
+
 def pointers(function):
     """{name: "ptr8", "ptr16" or "ptr32"} of the pointers in a viper function."""
-    found = {
-        a.arg: getattr(a.annotation, "id", "")
+    kinds = {
+        a.arg: kind
         for a in function.args.args
-        if a.annotation is not None
+        if (kind := getattr(a.annotation, "id", "")) in POINTERS
     }
-    for node in ast.walk(function):
-        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Call):
-            found |= {
-                t.id: getattr(node.value.func, "id", "")
-                for t in node.targets
-                if isinstance(t, ast.Name)
-            }
-    return found
+    before = None
+    while before != kinds:
+        before = dict(kinds)
+        for name, value in assigned(function):
+            kind = max(kind_of(value, kinds), kinds.get(name, ""), key=POINTERS.index)
+            if kind:
+                kinds[name] = kind
+    return kinds
 
 
 def faults(text):
@@ -75,13 +116,13 @@ def faults(text):
         for node in ast.walk(function):
             if isinstance(node, ast.UnaryOp):
                 wrong = isinstance(node.op, ast.USub | ast.Invert) and isinstance(
-                    node.operand, ast.Name
+                    bare(node.operand), ast.Name
                 )
             else:
                 wrong = (
                     isinstance(node, ast.Subscript)
-                    and kinds.get(getattr(node.value, "id", "")) in WIDE
-                    and getattr(node.slice, "id", "") in registers
+                    and kind_of(node.value, kinds) in WIDE
+                    and getattr(bare(node.slice), "id", "") in registers
                 )
             if wrong:
                 found.append(f"{function.name}, line {node.lineno}: {ast.unparse(node)}")
@@ -102,6 +143,15 @@ def test_no_expression_stands_there_that_changes_a_variable_of_its_own(file):
         ("p: ptr32", "i = 0; j = p[i]", "p[i]"),
         ("p: ptr32, n: int", "y = 0; x = n; y = -x", "-x"),
         ("p: ptr32, n: int", "n = p[0] & ~n", "~n"),
+        ("a, i: int", "i = ptr32(a)[i]", "ptr32(a)[i]"),
+        ("p: ptr32, i: int", "q = p; i = q[i]", "q[i]"),
+        ("a, i: int", "p, n = ptr32(a), 0; i = p[i]", "p[i]"),
+        ("a, i: int", "p: ptr32 = ptr32(a); i = p[i]", "p[i]"),
+        ("a, i: int", "p = ptr32(a) if i else ptr8(a); i = p[i]", "p[i]"),
+        ("p: ptr32, i: int", "i = p[int(i)]", "p[int(i)]"),
+        ("p: ptr32, i: int", "i = p[+i]", "p[+i]"),
+        ("p: ptr32, i: int", "i = p[(i := 2)]", "p[(i := 2)]"),
+        ("x: int", "y = -int(x)", "-int(x)"),
         # what is right: a byte's index, one that is worked out or constant, the fourth variable, a negated expression
         ("p: ptr8, n: int", "n += p[n]", None),
         ("p: ptr32, n: int", "n += p[n + 1] + p[2] + p[_N]", None),
@@ -130,12 +180,11 @@ def passed_on(text):
     found = []
     for function in filter(_is_viper, ast.walk(ast.parse(text))):
         kinds = pointers(function)
-        kinds = {name for name, kind in kinds.items() if kind.startswith("ptr")}
         for node in ast.walk(function):
             if (
                 isinstance(node, ast.Call)
                 and getattr(node.func, "id", "") not in ("ptr8", "ptr16", "ptr32", "int", "uint")
-                and kinds & {getattr(argument, "id", "") for argument in node.args}
+                and any(kind_of(argument, kinds) for argument in node.args)
             ):
                 found.append(f"{function.name}, line {node.lineno}: {ast.unparse(node)}")
     return found
