@@ -249,7 +249,11 @@ def _find_board(name: str) -> tuple[list[str], str]:
             program = _loaded(root, _NATIVE[_MACHINE].loader, str(root / "usr/bin" / program[0]))
         return qemu.command(name, image, program)
 
-    return _unpacked(wanted, command)
+    try:
+        return _unpacked(wanted, command)
+    except Unavailable as why:
+        said = str(why).rstrip(": ")
+        raise Unavailable(f"{said}; if {image} is damaged, delete it: it is built again") from None
 
 
 def _unpacked(wanted: list[str], command, version: str = "") -> tuple[list[str], str]:
